@@ -1,0 +1,157 @@
+"""From a BOP result file to scenes and back: one scene an image, with what could not be used set aside."""
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from physpose_torch.alternatives import find_alternatives
+from physpose_torch.bop.dataset import BopDataset
+from physpose_torch.bop.formats import Estimates, PlaneRecord, StaticRecord
+from physpose_torch.errors import PhysPoseError
+from physpose_torch.geometry.body import Body, Plane
+from physpose_torch.scene import Scene, Static
+
+__all__ = ["BodyLibrary", "ImageScene", "image_scenes", "plane_of"]
+
+logger = logging.getLogger("physpose_torch")
+
+MM = 1e-3
+
+
+class BodyLibrary:
+    """Bodies of a dataset's models and of static meshes, each made once.
+
+    Args:
+        dataset: where the models are.
+        options: decomposition options, see :meth:`Body.from_mesh`.
+    """
+
+    def __init__(self, dataset: BopDataset, **options) -> None:
+        self.dataset = dataset
+        self.options = options
+        self._made: dict[object, Body | PhysPoseError] = {}
+
+    def model(self, obj_id: int) -> Body:
+        """The body of a BOP object; the same error again if it could not be made."""
+        return self._once(obj_id, self._make_model)
+
+    def static(self, record: StaticRecord) -> Body:
+        """The body of a static mesh or box."""
+        return self._once(record, self._make_static)
+
+    def _once(self, key, make) -> Body:
+        if key not in self._made:
+            try:
+                self._made[key] = make(key)
+            except PhysPoseError as error:
+                self._made[key] = error
+        made = self._made[key]
+        if isinstance(made, PhysPoseError):
+            raise made
+        return made
+
+    def _make_model(self, obj_id: int) -> Body:
+        path = self.dataset.model_path(obj_id)
+        return Body.from_mesh(path, label=f"obj_{obj_id:06d}", scale=MM, **self.options)
+
+    def _make_static(self, record: StaticRecord) -> Body:
+        if record.mesh is None:
+            return Body.box(record.box, label=record.label)
+        return Body.from_mesh(record.mesh, label=record.label, scale=record.scale, **self.options)
+
+
+@dataclass
+class ImageScene:
+    """One image of a result file."""
+
+    scene_id: int
+    im_id: int
+    rows: np.ndarray
+    """Indices of its rows in the :class:`Estimates`."""
+    scene: Scene | None = None
+    """None if the image cannot be refined."""
+    problems: list[str] = field(default_factory=list)
+    """Why not."""
+
+    @property
+    def name(self) -> str:
+        return f"scene {self.scene_id} image {self.im_id}"
+
+
+def plane_of(record: PlaneRecord) -> Plane:
+    """The plane of a planes file, with its covariance where the file states both σ."""
+    covariance = None
+    if record.sigma_deg is not None or record.sigma is not None:
+        tilt, offset = np.deg2rad(record.sigma_deg or 0.0), record.sigma or 0.0
+        covariance = torch.diag(torch.tensor([tilt**2, tilt**2, offset**2], dtype=torch.float64))
+    return Plane(record.normal, torch.tensor(record.offset, dtype=torch.float64), covariance)
+
+
+def image_scenes(
+    estimates: Estimates,
+    library: BodyLibrary,
+    *,
+    planes: Mapping[tuple[int, int], PlaneRecord] | None = None,
+    statics: list[StaticRecord] = (),
+    counts: Mapping[tuple[int, int, int], int] | None = None,
+    broken: Mapping[tuple[int, int], list[str]] | None = None,
+) -> list[ImageScene]:
+    """One scene for each image that the estimates name, in file order.
+
+    Args:
+        estimates: the result file.
+        library: bodies by obj_id.
+        planes: table plane by (scene_id, im_id); an image without one gets no gravity and is refined by collisions only,
+            and says so if ``planes`` is given at all. None: collisions only, everywhere.
+        statics: static bodies, see :func:`physpose_torch.bop.formats.read_statics`.
+        counts: (scene_id, im_id, obj_id) → number of instances, from a targets file.
+        broken: images with rows or planes that cannot be used, and why; they are left alone.
+    """
+    images: dict[tuple[int, int], list[int]] = {}
+    for row, key in enumerate(zip(estimates.scene_id.tolist(), estimates.im_id.tolist(), strict=True)):
+        images.setdefault(key, []).append(row)
+    out = []
+    for key, rows in images.items():
+        image = ImageScene(*key, np.array(rows), problems=list((broken or {}).get(key, [])))
+        out.append(image)
+        if not image.problems and planes is not None and key not in planes:
+            image.problems.append(f"{image.name}: no plane in the planes file; add one, or leave out --planes")
+        if image.problems:
+            continue
+        try:
+            image.scene = _scene(image, estimates, library, planes, statics, counts or {})
+        except PhysPoseError as error:
+            image.problems.append(f"{image.name}: {error}")
+    return out
+
+
+def _scene(image: ImageScene, estimates: Estimates, library: BodyLibrary, planes, statics, counts) -> Scene:
+    key = (image.scene_id, image.im_id)
+    obj_ids = estimates.obj_id[image.rows].tolist()
+    objects = [library.model(i) for i in obj_ids]
+    standing, gravity = [], None
+    if planes is not None:
+        plane = plane_of(planes[key])
+        standing.append(Static(plane))
+        gravity = -plane.normal
+    for record in statics:
+        pose = record.pose(*key)
+        if pose is not None:
+            standing.append(Static(library.static(record), pose))
+    scene = Scene(objects, standing, gravity=gravity)
+    known = {(0, library.model(i).label): counts[(*key, i)] for i in set(obj_ids) if (*key, i) in counts}
+    same = find_alternatives(
+        estimates.T_camera_object[image.rows], scene, torch.from_numpy(estimates.score[image.rows]), counts=known
+    )
+    return Scene(objects, standing, gravity=gravity, same_object=same)
+
+
+def poses_of(images: list[ImageScene], estimates: Estimates) -> tuple[Tensor, Tensor]:
+    """Poses (N, 4, 4) [m] and scores (N,) of several images, in the order of their concatenated scene."""
+    rows = np.concatenate([i.rows for i in images]) if images else np.zeros(0, dtype=np.int64)
+    return estimates.T_camera_object[rows], torch.from_numpy(estimates.score[rows])

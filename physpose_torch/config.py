@@ -1,0 +1,132 @@
+"""Options, as frozen dataclasses with a sentence under each field; the command line is made from them."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from physpose_torch.errors import InvalidInputError
+
+__all__ = ["PhysicsConfig", "RefinerConfig", "Smoothing"]
+
+
+def _check_positive(config: object, *names: str) -> None:
+    for name in names:
+        if not getattr(config, name) > 0:
+            raise InvalidInputError(f"{type(config).__name__}.{name} = {getattr(config, name)}, expected a positive number")
+
+
+@dataclass(frozen=True)
+class Smoothing:
+    """Randomized smoothing of the distance gradient; the distance itself is never smoothed."""
+
+    kind: Literal["gaussian", "gumbel", "ring", "pose"] = "ring"
+    """``gaussian``: the paper's sampling. ``gumbel``: closed form. ``ring``: the expectation of ``gaussian`` by fixed
+    quadrature. ``pose``: averages the gradient over perturbed poses, the slow reference."""
+    noise: float = 0.1
+    """Standard deviation of the contact direction [rad], for ``gaussian``, ``ring`` and ``pose``."""
+    temperature: float = 1e-3
+    """Length ε of ``gumbel`` [m]: vertices this much behind the foremost one still count."""
+    samples: int = 16
+    """Draws of ``gaussian`` and ``pose``, directions on each ring of ``ring``."""
+    seed: int = 0
+    """Seed of the draws."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("gaussian", "gumbel", "ring", "pose"):
+            raise InvalidInputError(f"smoothing kind {self.kind!r}: expected gaussian, gumbel, ring or pose")
+        _check_positive(self, "noise", "temperature", "samples")
+
+
+@dataclass(frozen=True)
+class PhysicsConfig:
+    """The cost of a set of poses: pose + collision + gravity (paper Eq. 1). Lengths in metres."""
+
+    sigma_lateral: float = 0.003
+    """Standard deviation of an estimate across its viewing ray [m]."""
+    sigma_ray: float = 0.0
+    """Standard deviation of an estimate along its viewing ray [m], a constant part."""
+    sigma_ray_fraction: float = 0.03
+    """The part of it that grows with range: RGB estimators misjudge size and depth by a factor."""
+    sigma_rotation: float = 0.03
+    """Standard deviation of an estimate's rotation per axis [rad]."""
+    pose_weight: float = 1.0
+    """Weight of the pose cost; 0 switches it off."""
+    collision_weight: float = 2000.0
+    """Weight ζ_C of the collision cost [1/m]; 0 switches it off."""
+    gravity_weight: float = 500.0
+    """Weight ζ_G of the gravity cost [1/m]; 0 switches it off. Well below ζ_C, so that a stack does not press through."""
+    gravity: Literal["support", "paper"] = "support"
+    """``support``: how far the object can drop before it meets a support, static or not. ``paper``: mean distance of its
+    parts to the nearest static part below, which never vanishes for a tall object."""
+    gravity_reach: float = 0.05
+    """Objects higher than this above any support are left alone [m]: something unseen may carry them. ``support`` only."""
+    contact_tolerance: float = 1e-4
+    """An object nearer than this to anything [m] counts as touching it, which switches its gravity off (δ in the paper)."""
+    softness: float = 1e-3
+    """Penetrations and gaps below this [m] cost quadratically, so that contacts settle; 0 is the paper's hinge."""
+    smoothing: Smoothing | None = Smoothing()
+    """Randomized smoothing of the distance gradients; None for the exact ones."""
+    backend: str = "auto"
+    """Distance backend: ``auto``, or a name in ``physpose_torch.distance.backends()``."""
+
+    def __post_init__(self) -> None:
+        _check_positive(self, "sigma_lateral", "sigma_rotation", "gravity_reach")
+        for name in ("sigma_ray", "sigma_ray_fraction", "pose_weight", "collision_weight", "gravity_weight",
+                     "contact_tolerance", "softness"):
+            if not getattr(self, name) >= 0:
+                raise InvalidInputError(f"PhysicsConfig.{name} = {getattr(self, name)}, expected a number >= 0")
+        if self.sigma_ray == 0 and self.sigma_ray_fraction == 0:
+            raise InvalidInputError("PhysicsConfig: sigma_ray and sigma_ray_fraction are both 0; give one of them")
+        if self.gravity not in ("support", "paper"):
+            raise InvalidInputError(f"PhysicsConfig.gravity = {self.gravity!r}, expected 'support' or 'paper'")
+
+
+@dataclass(frozen=True)
+class RefinerConfig:
+    """How the cost is minimised."""
+
+    physics: PhysicsConfig = PhysicsConfig()
+    """The cost."""
+    optimizer: Literal["adam", "sgd"] = "adam"
+    """torch.optim.Adam on steps scaled by each estimate's σ, or plain gradient descent (the paper's)."""
+    steps: int = 100
+    """Largest number of steps."""
+    learning_rate: float = 0.15
+    """Adam: first step, in σ. sgd: the paper's step on the cost's gradient."""
+    decay: Literal["cosine", "none"] = "cosine"
+    """Learning rate over the steps; without decay contacts bounce by about learning_rate · ζ."""
+    max_gradient: float | None = None
+    """Gradients (6) of an object longer than this are shortened to it, as in the paper."""
+    max_step: float = 0.01
+    """No step moves an object, or turns its rim, by more than this [m]."""
+    tolerance: float = 2e-6
+    """An image stops when none of its objects moved by more than this [m] in a step, for ten steps on end."""
+    keep_trajectory: bool = False
+    """Keep the poses of every step in the result."""
+
+    def __post_init__(self) -> None:
+        _check_positive(self, "learning_rate", "max_step")
+        if not (isinstance(self.steps, int) and self.steps >= 0):
+            raise InvalidInputError(f"RefinerConfig.steps = {self.steps}, expected an integer >= 0")
+        if self.optimizer not in ("adam", "sgd") or self.decay not in ("cosine", "none"):
+            raise InvalidInputError(
+                f"RefinerConfig.optimizer = {self.optimizer!r}, decay = {self.decay!r}: "
+                "expected 'adam' or 'sgd', and 'cosine' or 'none'"
+            )
+        if not self.tolerance >= 0:
+            raise InvalidInputError(f"RefinerConfig.tolerance = {self.tolerance}, expected a number >= 0 [m]")
+
+    @classmethod
+    def paper(cls) -> "RefinerConfig":
+        """The paper's cost, weights and plain gradient descent (Sec. 3.1 and its public code)."""
+        physics = PhysicsConfig(
+            sigma_lateral=0.05,
+            sigma_ray=0.49,
+            sigma_ray_fraction=0.0,
+            sigma_rotation=0.26,
+            collision_weight=1.0,
+            gravity_weight=1.0,
+            gravity="paper",
+            softness=0.0,
+            smoothing=Smoothing("gaussian"),
+        )
+        return cls(physics, "sgd", steps=3000, learning_rate=1e-4, decay="none", max_gradient=1.0, tolerance=0.0)

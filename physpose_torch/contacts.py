@@ -1,0 +1,301 @@
+"""Who touches whom in a scene, how deep, and how far each object is above its support."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from physpose_torch.config import Smoothing
+from physpose_torch.distance.autograd import drop_distance, signed_distance
+from physpose_torch.distance.broadphase import instance_bounds, meeting_pairs, part_pairs, pairs_below
+from physpose_torch.distance.plane import half_space_distance
+from physpose_torch.scene import Scene
+
+__all__ = ["Contacts", "Drops", "find_contacts", "find_drops", "find_static_gaps"]
+
+SUPPORT_SLOPE = 0.3
+"""Least n·g at which a contact carries an object; a wall that is grazed on the way down does not."""
+FAR = 1e3
+"""[m]; how far down the paper's gravity looks for a static part."""
+
+
+class Contacts(NamedTuple):
+    """Signed distances of the part pairs that may touch. Entities: N objects, then S static bodies, then L planes."""
+
+    distance: Tensor
+    """(E,) [m], differentiable."""
+    pair: Tensor
+    """(E,) which of the D pairs of bodies below each part pair belongs to."""
+    pair_first: Tensor
+    """(D,) entity, always a movable object."""
+    pair_second: Tensor
+    """(D,) entity."""
+    moves_first: Tensor
+    """(D,) bool: the pair acts on its first body (not so if the second one is an alternative that pushes nobody)."""
+    moves_second: Tensor
+    """(D,) bool, likewise; False for statics."""
+
+
+class Drops(NamedTuple):
+    """How far each object is above what would carry it."""
+
+    height: Tensor
+    """(N,) [m], differentiable; 0 in contact, infinite where nothing within reach would carry it."""
+    support: Tensor
+    """(N,) entity that would carry it, numbered as in :class:`Contacts`; -1: none."""
+    touching: Tensor
+    """(N,) bool: gravity is off because something already carries or touches it."""
+
+
+def find_contacts(
+    poses: Tensor,
+    scene: Scene,
+    *,
+    acts: Tensor | None = None,
+    margin: float = 0.0,
+    smoothing: Smoothing | None = None,
+    backend: str = "auto",
+) -> Contacts:
+    """Signed distances of all part pairs whose boxes come within ``margin``, and of all parts to their planes.
+
+    Args:
+        poses: T_camera_object (N, 4, 4) [m].
+        scene: the scene.
+        acts: (N,) bool, False for alternatives that feel the scene and push nobody; None: all act.
+        margin: [m].
+        smoothing, backend: see :func:`physpose_torch.distance.autograd.signed_distance`.
+    """
+    n, device = len(scene), poses.device
+    acts = _all_act(scene, acts)
+    T = scene.entity_poses(poses)
+    entity = scene.instance_entity
+    entity_pairs = _felt(scene.entity_pairs, acts, n)
+    pairs = meeting_pairs(_bounds(T, scene), entity, scene.instance_start, entity_pairs, margin=margin)
+    first, second = entity[pairs[:, 0]], entity[pairs[:, 1]]
+    moves_first, moves_second = _moves(first, second, acts, n)
+    distance = signed_distance(
+        _gather(T, first, moves_first),
+        _gather(T, second, moves_second),
+        scene.parts,
+        scene.instance_part[pairs],
+        smoothing=smoothing,
+        backend=backend,
+    ).distance
+
+    instance, plane = _plane_instances(scene)
+    below = half_space_distance(
+        T[entity[instance].to(device)],
+        scene.parts,
+        scene.instance_part[instance].to(device),
+        scene.plane_normal.to(poses)[plane],
+        scene.plane_offset.to(poses)[plane],
+        smoothing=smoothing,
+    ).distance
+
+    n_entities = len(scene.entity_image)
+    ends = torch.stack([torch.cat([first, entity[instance]]), torch.cat([second, plane + n_entities])], dim=1)
+    bodies, pair = torch.unique(ends, dim=0, return_inverse=True)
+    moves = _moves(bodies[:, 0], bodies[:, 1], acts, n)
+    index = (x.to(device) for x in (pair, bodies[:, 0], bodies[:, 1], *moves))
+    return Contacts(torch.cat([distance, below]), *index)
+
+
+def find_drops(
+    poses: Tensor,
+    scene: Scene,
+    *,
+    acts: Tensor | None = None,
+    reach: float,
+    smoothing: Smoothing | None = None,
+    backend: str = "auto",
+) -> Drops:
+    """How far each object can fall before it meets a plane, a static body or another object.
+
+    The gradient is the falling object's alone: gravity pulls it down, it does not lift what is below.
+
+    Args:
+        poses, scene, acts, smoothing, backend: as in :func:`find_contacts`.
+        reach: longer falls [m] count as endless.
+    """
+    n, device = len(scene), poses.device
+    acts = _all_act(scene, acts)
+    T = scene.entity_poses(poses)
+    entity, gravity = scene.instance_entity, scene.gravity.to(poses)
+    falls = (scene.gravity != 0).any(-1)
+    both_ways = torch.cat([scene.entity_pairs, scene.entity_pairs.flip(1)])
+    carries = torch.ones(len(scene.entity_image), dtype=torch.bool)
+    carries[:n] = acts
+    both_ways = both_ways[(both_ways[:, 0] < n) & carries[both_ways[:, 1]] & falls[scene.entity_image[both_ways[:, 0]]]]
+    pairs = pairs_below(_bounds(T, scene), entity, scene.instance_start, both_ways, reach=reach)
+    who, onto = entity[pairs[:, 0]], entity[pairs[:, 1]]
+    down = gravity[scene.image.to(device)[who.to(device)]]
+    fall = drop_distance(
+        _gather(T, who, torch.ones_like(who, dtype=torch.bool)),
+        _gather(T, onto, torch.zeros_like(onto, dtype=torch.bool)),
+        scene.parts,
+        scene.instance_part[pairs],
+        down,
+        limit=reach,
+        smoothing=smoothing,
+        backend=backend,
+    )
+    carried = (fall.normal * down).sum(-1) >= SUPPORT_SLOPE
+    height = torch.where(carried, fall.distance, torch.inf)
+
+    instance, plane = _plane_instances(scene)
+    who_plane = entity[instance]
+    down = gravity[scene.image.to(device)[who_plane.to(device)]]
+    normal = scene.plane_normal.to(poses)[plane]
+    above = half_space_distance(
+        T[who_plane.to(device)],
+        scene.parts,
+        scene.instance_part[instance].to(device),
+        normal,
+        scene.plane_offset.to(poses)[plane],
+        smoothing=smoothing,
+    ).distance
+    slope = -(normal.detach() * down).sum(-1)
+    above = torch.where(slope >= SUPPORT_SLOPE, above.clamp_min(0.0) / slope.clamp_min(SUPPORT_SLOPE), torch.inf)
+    above = torch.where(above <= reach, above, torch.inf)
+
+    height = torch.cat([height, above])
+    who = torch.cat([who, who_plane]).to(device)
+    onto = torch.cat([onto, plane + len(scene.entity_image)]).to(device)
+    least, which = _least(height.detach(), who, n)
+    found = least.isfinite()
+    lowest = torch.cat([height, height.new_full((1,), torch.inf)])[torch.where(found, which, len(height))]
+    support = torch.where(found, torch.cat([onto, onto.new_full((1,), -1)])[torch.where(found, which, len(onto))], -1)
+    return Drops(lowest, support, least <= 0.0)
+
+
+def find_static_gaps(
+    poses: Tensor,
+    scene: Scene,
+    contacts: Contacts,
+    *,
+    tolerance: float,
+    smoothing: Smoothing | None = None,
+    backend: str = "auto",
+) -> Drops:
+    """The paper's gravity: mean positive distance of an object's parts to the static part nearest below (Eq. 9).
+
+    Args:
+        poses, scene, smoothing, backend: as in :func:`find_contacts`.
+        contacts: those of the same poses, with a margin of at least ``tolerance``.
+        tolerance: an object any part of which is nearer than this to anything [m] feels no gravity.
+    """
+    n, device = len(scene), poses.device
+    T = scene.entity_poses(poses)
+    entity, start = scene.instance_entity, scene.instance_start
+    static_pairs = scene.entity_pairs[scene.entity_pairs[:, 1] >= n]
+    falls = (scene.gravity != 0).any(-1)
+    static_pairs = static_pairs[falls[scene.image[static_pairs[:, 0]]]]
+    gravity = scene.gravity.to(poses)
+    with torch.no_grad():
+        pairs = pairs_below(_bounds(T, scene), entity, start, static_pairs, reach=FAR)
+        who = entity[pairs[:, 0]].to(device)
+        down = gravity[scene.image.to(device)[who]]
+        fall = drop_distance(T[who], T[entity[pairs[:, 1]].to(device)], scene.parts, scene.instance_part[pairs], down,
+                             limit=FAR, backend=backend)
+        height = torch.where((fall.normal * down).sum(-1) >= SUPPORT_SLOPE, fall.distance, torch.inf)
+        plane_pairs = scene.plane_pairs[falls[scene.image[scene.plane_pairs[:, 0]]]]
+        # all parts of the object against each plane of its image: the nearest part decides which static part is B
+        instance, plane = _plane_instances(scene, plane_pairs)
+        above = half_space_distance(
+            T[entity[instance].to(device)], scene.parts, scene.instance_part[instance].to(device),
+            scene.plane_normal.to(poses)[plane], scene.plane_offset.to(poses)[plane],
+        ).distance
+        candidate_who = torch.cat([who, entity[instance].to(device)])
+        n_instances = len(entity)
+        candidate = torch.cat([pairs[:, 1], plane + n_instances]).to(device)
+        least, which = _least(torch.cat([height, above.clamp_min(0.0)]), candidate_who, n)
+        found = least.isfinite()
+        below = torch.where(found, torch.cat([candidate, candidate.new_full((1,), -1)])[torch.where(found, which, -1)], -1)
+
+    chosen = below[entity[: int(start[n])].to(device)].cpu()  # what each object's instance is measured against
+    instance = torch.arange(int(start[n]))
+    on_body = ((chosen >= 0) & (chosen < n_instances)).nonzero()[:, 0]
+    on_plane = (chosen >= n_instances).nonzero()[:, 0]
+    to_body = signed_distance(
+        T[entity[on_body].to(device)],
+        T[entity[chosen[on_body]].to(device)].detach(),
+        scene.parts,
+        scene.instance_part[torch.stack([on_body, chosen[on_body]], dim=1)],
+        smoothing=smoothing,
+        backend=backend,
+    ).distance
+    plane = chosen[on_plane] - n_instances
+    to_plane = half_space_distance(
+        T[entity[on_plane].to(device)],
+        scene.parts,
+        scene.instance_part[on_plane].to(device),
+        scene.plane_normal.to(poses)[plane],
+        scene.plane_offset.to(poses)[plane],
+        smoothing=smoothing,
+    ).distance
+    gap = poses.new_zeros(len(instance))
+    gap = gap.index_put((on_body.to(device),), to_body).index_put((on_plane.to(device),), to_plane).clamp_min(0.0)
+    count = start.diff()[:n].to(poses)
+    mean = poses.new_zeros(n).index_add(0, entity[: len(instance)].to(device), gap) / count
+    nearest = _least(contacts.distance.detach(), contacts.pair_first[contacts.pair], n)[0]
+    movable = contacts.pair_second < n
+    on_second = movable[contacts.pair]
+    other = _least(contacts.distance.detach()[on_second], contacts.pair_second[contacts.pair][on_second], n)[0]
+    height = torch.where(below >= 0, mean, torch.inf)
+    entity_below = torch.where(
+        below >= n_instances, below - n_instances + len(scene.entity_image),
+        torch.where(below >= 0, entity.to(device)[below.clamp(0, n_instances - 1)], -1),
+    ) if n_instances else below
+    return Drops(height, entity_below, torch.minimum(nearest, other) < tolerance)
+
+
+def _bounds(T: Tensor, scene: Scene):
+    entity = scene.instance_entity
+    with torch.no_grad():
+        bounds = instance_bounds(
+            T.detach()[entity.to(T.device)],
+            scene.parts,
+            scene.instance_part.to(T.device),
+            scene.gravity.to(T)[scene.entity_image[entity].to(T.device)],
+        )
+    return type(bounds)(*(x.cpu() for x in bounds))
+
+
+def _all_act(scene: Scene, acts: Tensor | None) -> Tensor:
+    return torch.ones(len(scene), dtype=torch.bool) if acts is None else acts
+
+
+def _felt(entity_pairs: Tensor, acts: Tensor, n: int) -> Tensor:
+    """Pairs without those of two alternatives that push nobody: neither would feel the other."""
+    moves = _moves(entity_pairs[:, 0], entity_pairs[:, 1], acts, n)
+    return entity_pairs[moves[0] | moves[1]]
+
+
+def _moves(first: Tensor, second: Tensor, acts: Tensor, n: int) -> tuple[Tensor, Tensor]:
+    """Whether a contact acts on its first and on its second entity."""
+    static = second >= n
+    second_acts = static | acts[second.clamp_max(n - 1)] if n else static
+    return second_acts, acts[first] & ~static
+
+
+def _gather(T: Tensor, index: Tensor, moves: Tensor) -> Tensor:
+    index, moves = index.to(T.device), moves.to(T.device)
+    return torch.where(moves[:, None, None], T[index], T.detach()[index])
+
+
+def _plane_instances(scene: Scene, plane_pairs: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """(instance, plane) of every part of every object with the planes of its image."""
+    pairs = scene.plane_pairs if plane_pairs is None else plane_pairs
+    count = scene.instance_start.diff()[pairs[:, 0]]
+    pair = torch.repeat_interleave(torch.arange(len(pairs)), count)
+    within = torch.arange(len(pair)) - (count.cumsum(0) - count)[pair]
+    return scene.instance_start[pairs[pair, 0]] + within, pairs[pair, 1]
+
+
+def _least(value: Tensor, group: Tensor, n: int) -> tuple[Tensor, Tensor]:
+    """Least value (n,) of each group, infinite where it is empty, and the index (n,) of its first bearer."""
+    least = value.new_full((n,), torch.inf).scatter_reduce(0, group, value, "amin")
+    index = torch.arange(len(value), device=value.device)
+    bearer = value == least[group]
+    first = torch.full((n,), len(value), device=value.device).scatter_reduce(0, group[bearer], index[bearer], "amin")
+    return least, first.clamp_max(max(len(value) - 1, 0))

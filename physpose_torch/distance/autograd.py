@@ -1,0 +1,202 @@
+"""Signed and drop distances of part pairs, differentiable with respect to both poses, over any backend."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from physpose_torch import se3
+from physpose_torch.config import Smoothing
+from physpose_torch.distance.smoothing import smoothed_points
+from physpose_torch.distance.support import DistanceResult
+from physpose_torch.errors import InvalidInputError, MissingExtraError
+from physpose_torch.geometry.convex import ConvexParts
+
+__all__ = ["backends", "drop_distance", "signed_distance"]
+
+Backend = Callable[[ConvexParts, Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]
+
+CONTACT = 1e-9
+"""[m]; a falling part has arrived when it is this near."""
+DROP_STEPS = 30
+
+
+def backends() -> list[str]:
+    """Names of the distance backends that this installation can run, best first."""
+    try:
+        import fcl  # noqa: F401
+    except ImportError:
+        return []
+    return ["fcl"]
+
+
+def signed_distance(
+    T_a: Tensor,
+    T_b: Tensor,
+    parts: ConvexParts,
+    pairs: Tensor,
+    *,
+    backend: str = "auto",
+    smoothing: Smoothing | None = None,
+) -> DistanceResult:
+    """Signed distances of pairs of convex parts.
+
+    The gradient is Danskin's: with witness points a, b (body frames) and the normal n from a to b, ∂d/∂T_a = -n ⊗ [a; 1]
+    and ∂d/∂T_b = n ⊗ [b; 1]. With ``smoothing`` the witness points in it are smoothed (paper Sec. 2 and appendix).
+
+    Args:
+        T_a, T_b: (E, 4, 4) poses of the bodies that the parts belong to, in one frame [m].
+        parts: convex parts of all bodies.
+        pairs: (E, 2) long, indices of parts a and b.
+        backend: ``auto``, or one of :func:`backends`.
+        smoothing: smoothing of the gradient; None for the exact one.
+
+    Raises:
+        InvalidInputError: shapes do not match, or the backend is unknown.
+        MissingExtraError: no distance backend is installed.
+    """
+    if pairs.ndim != 2 or pairs.shape[1] != 2 or T_a.shape != (len(pairs), 4, 4) or T_b.shape != T_a.shape:
+        raise InvalidInputError(
+            f"T_a {tuple(T_a.shape)}, T_b {tuple(T_b.shape)}, pairs {tuple(pairs.shape)}: "
+            "expected (E, 4, 4), (E, 4, 4) and (E, 2)"
+        )
+    return DistanceResult(*_SignedDistance.apply(T_a, T_b, parts, pairs, _backend(backend), smoothing))
+
+
+def drop_distance(
+    T_a: Tensor,
+    T_b: Tensor,
+    parts: ConvexParts,
+    pairs: Tensor,
+    gravity: Tensor,
+    *,
+    limit: float,
+    backend: str = "auto",
+    smoothing: Smoothing | None = None,
+) -> DistanceResult:
+    """How far parts a can fall along gravity before they meet parts b.
+
+    Conservative advancement: the distance along the fall is convex, so stepping by d / (n·g) never overshoots. The
+    gradient is that of the distance at the meeting point divided by n·g (design: h = max over n·g > 0 of the gap / n·g).
+
+    Args:
+        T_a, T_b, parts, pairs, backend, smoothing: as in :func:`signed_distance`.
+        gravity: (E, 3) unit vectors, pointing down.
+        limit: falls longer than this [m] count as never meeting.
+
+    Returns:
+        distance: (E,) [m], 0 where they already touch or overlap, infinite where they never meet; normal and witness
+        points are those at the meeting point, a's before the fall.
+    """
+    with torch.no_grad():
+        run = _backend(backend)
+        fall = T_a.new_zeros(len(pairs))
+        active = torch.arange(len(pairs), device=T_a.device)
+        for _ in range(DROP_STEPS):
+            if len(active) == 0:
+                break
+            T_fallen = _moved(T_a[active], fall[active, None] * gravity[active])
+            distance, normal, _, _ = _query(run, T_fallen, T_b[active], parts, pairs[active])
+            rate = (normal * gravity[active]).sum(-1)
+            falling = distance > CONTACT
+            step = torch.where(rate > 0, distance / rate.clamp_min(1e-300), torch.inf)
+            fall[active] = fall[active] + torch.where(falling, step, 0.0)
+            active = active[falling & (fall[active] <= limit)]
+        fall = torch.where(fall <= limit, fall, torch.inf)
+        meets = fall.isfinite().nonzero()[:, 0]
+    gravity_at, T_a_at = gravity[meets], T_a[meets]
+    shifted = _moved(T_a_at, fall[meets, None] * gravity_at)
+    at = signed_distance(shifted, T_b[meets], parts, pairs[meets], backend=backend, smoothing=smoothing)
+    rate = (at.normal * gravity_at).sum(-1).clamp_min(1e-3)
+    value = fall[meets] + (at.distance - at.distance.detach()) / rate
+    out = DistanceResult(fall, torch.zeros_like(gravity), torch.zeros_like(gravity), torch.zeros_like(gravity))
+    return DistanceResult(
+        out.distance.index_put((meets,), value),
+        out.normal.index_put((meets,), at.normal),
+        out.point_a.index_put((meets,), at.point_a - fall[meets, None] * gravity_at),
+        out.point_b.index_put((meets,), at.point_b),
+    )
+
+
+class _SignedDistance(torch.autograd.Function):
+    """Distances by a backend; the gradient from normal and (smoothed) witness points."""
+
+    @staticmethod
+    def forward(ctx, T_a, T_b, parts, pairs, run, smoothing):
+        distance, normal, point_a, point_b = _query(run, T_a, T_b, parts, pairs)
+        if smoothing is not None and smoothing.kind == "pose":
+            gradient_a, gradient_b = _pose_gradient(run, T_a, T_b, parts, pairs, smoothing)
+        else:
+            n, a, b = normal, point_a, point_b
+            if smoothing is not None:
+                masks = [parts.padded_mask[i].to(T_a.device) for i in pairs.unbind(1)]
+                vertices_a, vertices_b = (
+                    se3.apply(T, parts.padded[i].to(T)) for T, i in zip((T_a, T_b), pairs.unbind(1), strict=True)
+                )
+                n, a, b = smoothed_points(vertices_a, masks[0], vertices_b, masks[1], normal, smoothing)
+            gradient_a, gradient_b = -_outer(n, T_a, a), _outer(n, T_b, b)
+        ctx.save_for_backward(gradient_a, gradient_b)
+        ctx.mark_non_differentiable(normal, point_a, point_b)
+        return distance, normal, point_a, point_b
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad_distance, *_):
+        gradient_a, gradient_b = ctx.saved_tensors
+        weight = grad_distance[:, None, None]
+        return weight * gradient_a, weight * gradient_b, None, None, None, None
+
+
+def _backend(name: str) -> Backend:
+    installed = backends()
+    if name == "auto":
+        if not installed:
+            raise MissingExtraError("no distance backend is installed; pip install python-fcl")
+        name = installed[0]
+    if name not in installed:
+        raise InvalidInputError(f"distance backend {name!r} is not available; installed here: {', '.join(installed)}")
+    from physpose_torch.distance.fcl import fcl_distance
+
+    return {"fcl": fcl_distance}[name]
+
+
+def _query(run: Backend, T_a: Tensor, T_b: Tensor, parts: ConvexParts, pairs: Tensor) -> tuple[Tensor, ...]:
+    """One backend call, results in the frame of the poses and in their dtype and device."""
+    T_a64, T_b64 = T_a.detach().double().cpu(), T_b.detach().double().cpu()
+    R_a = T_a64[:, :3, :3]
+    R = R_a.mT @ T_b64[:, :3, :3]
+    t = (R_a.mT @ (T_b64 - T_a64)[:, :3, 3:])[:, :, 0]  # relative: nothing is lost far from the origin
+    if len(pairs) == 0:
+        empty = t.to(T_a)
+        return empty[:, 0], empty, empty, empty
+    distance, normal, point_a, point_b = run(parts.to(device="cpu", dtype=torch.float64), pairs.cpu(), R, t)
+    normal, point_a, point_b = ((R_a @ x[:, :, None])[:, :, 0] for x in (normal, point_a, point_b))
+    origin = T_a64[:, :3, 3]
+    return distance.to(T_a), normal.to(T_a), (point_a + origin).to(T_a), (point_b + origin).to(T_a)
+
+
+def _pose_gradient(run, T_a, T_b, parts, pairs, smoothing: Smoothing) -> tuple[Tensor, Tensor]:
+    """E[∂d(T exp ξ)/∂T] over antithetic rotations ξ of both bodies: unbiased, one backend call a sample."""
+    generator = torch.Generator().manual_seed(smoothing.seed)
+    half = torch.randn((smoothing.samples + 1) // 2, 2, len(pairs), 3, generator=generator, dtype=torch.float64)
+    half = half.to(T_a) * smoothing.noise
+    total_a, total_b = torch.zeros_like(T_a), torch.zeros_like(T_b)
+    for xi_a, xi_b in torch.cat([half, -half]):
+        E_a, E_b = (se3.from_rotation_translation(se3.exp_so3(xi), torch.zeros_like(xi)) for xi in (xi_a, xi_b))
+        _, n, a, b = _query(run, T_a @ E_a, T_b @ E_b, parts, pairs)
+        total_a -= _outer(n, T_a @ E_a, a) @ E_a.mT
+        total_b += _outer(n, T_b @ E_b, b) @ E_b.mT
+    return total_a / (2 * len(half)), total_b / (2 * len(half))
+
+
+def _outer(normal: Tensor, T: Tensor, point: Tensor) -> Tensor:
+    """n ⊗ [T⁻¹ point; 1] as (E, 4, 4) with a zero bottom row."""
+    local = ((point - T[:, :3, 3])[:, None] @ T[:, :3, :3])[:, 0]
+    top = normal[:, :, None] * torch.cat([local, torch.ones_like(local[:, :1])], dim=-1)[:, None]
+    return torch.cat([top, torch.zeros_like(top[:, :1])], dim=1)
+
+
+def _moved(T: Tensor, shift: Tensor) -> Tensor:
+    out = T.clone()
+    out[:, :3, 3] = out[:, :3, 3] + shift
+    return out

@@ -1,0 +1,191 @@
+"""What a scene is made of: rigid bodies with convex parts, and planes."""
+
+import warnings
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from physpose_torch import se3
+from physpose_torch.errors import DataError, InvalidInputError
+from physpose_torch.geometry.convex import ConvexParts
+from physpose_torch.geometry.decompose import DecomposeOptions, DecomposeReport, decompose
+
+__all__ = ["Body", "Plane", "load_mesh"]
+
+CYLINDER_SIDES = 32
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A rigid body: its surface mesh and its convex parts, both in the body frame [m]."""
+
+    label: str
+    """Name of the object; error messages and reports use it."""
+    parts: ConvexParts
+    """Convex parts of this one body."""
+    mesh: trimesh.Trimesh
+    """Surface mesh, for pictures, metrics and reports."""
+    symmetries: Tensor | None = None
+    """(S, 4, 4) transforms of the body frame that leave the body as it is, identity included; None: no symmetry."""
+    decomposition: DecomposeReport | None = None
+    """How well the parts cover the mesh; None where the shape is exact."""
+
+    @classmethod
+    def from_mesh(
+        cls,
+        mesh: trimesh.Trimesh | str | Path,
+        *,
+        label: str,
+        scale: float = 1.0,
+        symmetries: Tensor | None = None,
+        cache: bool = True,
+        **coacd_options,
+    ) -> "Body":
+        """Decompose a mesh into convex parts (cached on disk by content and options).
+
+        Args:
+            mesh: a trimesh, or the path of any file that trimesh reads. Need not be watertight.
+            label: name of the object.
+            scale: factor to metres: 0.001 for the millimetre meshes of BOP.
+            symmetries: (S, 4, 4) symmetry transforms [m] with the identity, if any.
+            cache: keep the decomposition in the user's cache folder (``PHYSPOSE_CACHE`` moves it).
+            **coacd_options: fields of :class:`~physpose_torch.geometry.decompose.DecomposeOptions`.
+
+        Raises:
+            DataError: the file is missing or cannot be read.
+            InvalidInputError: the mesh is empty, not finite, or without volume; an option is unknown.
+        """
+        mesh = load_mesh(mesh, label=label, scale=scale)
+        try:
+            options = DecomposeOptions(**coacd_options)
+        except TypeError as error:
+            known = ", ".join(DecomposeOptions.__dataclass_fields__)
+            raise InvalidInputError(f"{label}: {error}; decomposition options are {known}") from error
+        hulls, report = decompose(mesh, options, cache=cache)
+        return cls(label, ConvexParts.from_hulls(hulls), mesh, _checked_symmetries(symmetries, label), report)
+
+    @classmethod
+    def box(cls, extents, *, label: str) -> "Body":
+        """A box centred at the origin with the full side lengths ``extents`` (3,) [m]."""
+        size = torch.as_tensor(extents, dtype=torch.float64)
+        if size.shape != (3,) or not bool((size > 0).all()) or not bool(size.isfinite().all()):
+            raise InvalidInputError(f"{label}: extents = {extents}, expected three positive lengths [m]")
+        mesh = trimesh.creation.box(extents=size.numpy())
+        return cls(label, ConvexParts.from_hulls([mesh.vertices]), mesh)
+
+    @classmethod
+    def cylinder(cls, radius: float, height: float, *, label: str) -> "Body":
+        """A cylinder along z, centred at the origin; one part, a prism of 32 sides with the same radius [m]."""
+        if not (np.isfinite([radius, height]).all() and radius > 0 and height > 0):
+            raise InvalidInputError(f"{label}: radius = {radius}, height = {height}, expected positive lengths [m]")
+        mesh = trimesh.creation.cylinder(radius=radius, height=height, sections=CYLINDER_SIDES)
+        rim = mesh.vertices[np.linalg.norm(mesh.vertices[:, :2], axis=1) > 0.5 * radius]
+        return cls(label, ConvexParts.from_hulls([rim]), mesh)
+
+    @cached_property
+    def lower(self) -> Tensor:
+        """(3,) least coordinates of the mesh [m]."""
+        return torch.tensor(self.mesh.bounds[0], dtype=torch.float64)
+
+    @cached_property
+    def upper(self) -> Tensor:
+        """(3,) greatest coordinates of the mesh [m]."""
+        return torch.tensor(self.mesh.bounds[1], dtype=torch.float64)
+
+    @property
+    def center(self) -> Tensor:
+        """(3,) centre of the bounds; viewing rays go there [m]."""
+        return 0.5 * (self.lower + self.upper)
+
+    @cached_property
+    def radius(self) -> float:
+        """Largest distance of a surface point from :attr:`center` [m]."""
+        return float(np.linalg.norm(self.mesh.vertices - self.center.numpy(), axis=1).max())
+
+    def __repr__(self) -> str:
+        size = " × ".join(f"{1000 * e:.0f}" for e in self.upper - self.lower)
+        return f"Body({self.label!r}, {self.parts.n_parts} parts, {size} mm)"
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """The half-space below ``normal · x = offset`` in the camera frame [m]; the normal points up, out of the table."""
+
+    normal: Tensor
+    """(3,) unit vector."""
+    offset: Tensor
+    """() [m]."""
+    covariance: Tensor | None = None
+    """(3, 3) of (two tilts [rad], offset [m]) at the point under the objects' centre; None: exact."""
+
+    def __post_init__(self) -> None:
+        like = next((x for x in (self.normal, self.offset) if isinstance(x, Tensor) and x.is_floating_point()), None)
+        dtype, device = (like.dtype, like.device) if like is not None else (torch.float64, None)
+        for name, shape in (("normal", (3,)), ("offset", ()), ("covariance", (3, 3))):
+            value = getattr(self, name)
+            if value is None and name == "covariance":
+                continue
+            value = torch.as_tensor(value, dtype=dtype, device=device)
+            if value.shape != shape or not bool(value.detach().isfinite().all()):
+                raise InvalidInputError(f"Plane {name} = {value.tolist()}, expected finite numbers of shape {shape}")
+            object.__setattr__(self, name, value)
+        length = float(torch.linalg.vector_norm(self.normal.detach()))
+        if abs(length - 1.0) > 1e-3:
+            raise InvalidInputError(f"Plane normal has length {length:.4g}, expected a unit vector pointing up")
+        object.__setattr__(self, "normal", self.normal / torch.linalg.vector_norm(self.normal))
+
+    @classmethod
+    def from_pose(cls, T_camera_table: Tensor) -> "Plane":
+        """The plane z = 0 of a table frame whose z axis points up."""
+        se3.check_rigid(T_camera_table, "T_camera_table")
+        normal = T_camera_table[:3, 2]
+        return cls(normal, normal @ T_camera_table[:3, 3])
+
+
+def load_mesh(mesh: trimesh.Trimesh | str | Path, *, label: str, scale: float = 1.0) -> trimesh.Trimesh:
+    """A copy of the mesh in metres, with equal vertices merged.
+
+    Raises:
+        DataError: the file is missing, cannot be read, or holds no surface.
+        InvalidInputError: the scale is not positive.
+    """
+    if not (np.isfinite(scale) and scale > 0):
+        raise InvalidInputError(f"{label}: scale = {scale}, expected a positive factor to metres (0.001 for mm)")
+    if isinstance(mesh, str | Path):
+        path = Path(mesh)
+        if not path.is_file():
+            raise DataError(f"{label}: no mesh file {path}")
+        try:
+            mesh = trimesh.load_mesh(path, process=False)
+        except Exception as error:  # whatever the many file readers raise
+            raise DataError(f"{label}: cannot read {path} as a mesh ({type(error).__name__}: {error})") from error
+    if isinstance(mesh, trimesh.Scene):
+        mesh = mesh.to_mesh()
+    if not isinstance(mesh, trimesh.Trimesh):
+        raise InvalidInputError(f"{label}: got a {type(mesh).__name__}, expected a trimesh.Trimesh or the path of a mesh")
+    if len(mesh.faces) == 0:
+        raise DataError(f"{label}: the mesh has no faces; convex parts need a surface")
+    # only geometry is kept: texture seams would split vertices, and visuals are not ours to copy
+    out = trimesh.Trimesh(np.asarray(mesh.vertices, dtype=np.float64) * scale, mesh.faces, process=False)
+    if not np.isfinite(out.vertices).all():
+        raise DataError(f"{label}: the mesh has NaN or infinite vertices")
+    out.merge_vertices(merge_tex=True, merge_norm=True)
+    extent = float(out.extents.max())
+    if extent > 10.0:
+        warnings.warn(
+            f"{label} is {extent:.3g} m large; are its vertices in millimetres? Then pass scale=0.001", stacklevel=3
+        )
+    return out
+
+
+def _checked_symmetries(symmetries: Tensor | None, label: str) -> Tensor | None:
+    if symmetries is None:
+        return None
+    symmetries = torch.as_tensor(symmetries, dtype=torch.float64)
+    se3.check_rigid(symmetries, f"{label}: symmetries")
+    return symmetries

@@ -1,0 +1,115 @@
+"""The layer to append to a pose estimator: poses in, physically consistent poses out."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from physpose_torch.config import RefinerConfig
+from physpose_torch.losses import PhysicsLoss, PhysicsTerms, acting, check_poses, check_precision
+from physpose_torch.report import PhysicsReport, physics_report
+from physpose_torch.scene import Scene
+from physpose_torch.solvers.descent import descend
+
+__all__ = ["PhysPoseRefiner", "Refinement"]
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement:
+    """Refined poses and what there is to know about them."""
+
+    poses: Tensor
+    """T_camera_object, (..., N, 4, 4) [m], in the caller's dtype and on its device."""
+    report: PhysicsReport
+    """Penetration, gap and support of each object at the refined poses."""
+    terms: PhysicsTerms
+    """Costs (..., N) at the refined poses."""
+    trajectory: Tensor | None
+    """(steps + 1, ..., N, 4, 4) if the config keeps it."""
+    steps: Tensor
+    """(..., I) steps that each image took."""
+    converged: Tensor
+    """(..., I) bool: the image came to rest before the step limit."""
+    image: Tensor
+    """(N,) image of each object, as in the scene."""
+
+    def best(self) -> Tensor:
+        """Poses (N, 4, 4) of the hypothesis with the lowest cost, chosen image by image."""
+        poses = self.poses.reshape(-1, *self.poses.shape[-3:])
+        cost = self.terms.total.reshape(len(poses), -1)
+        image = self.image.to(cost.device)
+        per_image = cost.new_zeros(len(poses), self.steps.shape[-1]).index_add(1, image, cost)
+        choice = per_image.argmin(0)[image]
+        return poses[choice, torch.arange(poses.shape[1], device=poses.device)]
+
+
+class PhysPoseRefiner(nn.Module):
+    """Refine all poses of each image together, so that they are physically consistent (paper Sec. 3.1).
+
+    Args:
+        config: cost and optimizer; None: the tuned default. ``RefinerConfig.paper()`` is the paper's.
+    """
+
+    def __init__(self, config: RefinerConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or RefinerConfig()
+        self.loss = PhysicsLoss(self.config.physics)
+
+    def forward(
+        self,
+        poses: Tensor,
+        scene: Scene,
+        *,
+        measured_covariance: Tensor | None = None,
+        scores: Tensor | None = None,
+        callback: Callable[[int, Tensor, PhysicsTerms], None] | None = None,
+    ) -> Refinement:
+        """Refine the poses of a scene. Works under ``no_grad`` and ``inference_mode``; nothing is drawn at random.
+
+        Args:
+            poses: estimates T̃_camera_object, (..., N, 4, 4) [m]; leading dimensions are hypotheses of the same scene.
+            scene: the N objects (of one or many images), statics and gravity.
+            measured_covariance: (..., N, 6, 6) of the estimates, order [t in the camera frame, log(R̃ᵀR) in the object
+                frame]; None: from the config's sigmas.
+            scores: (N,), see :class:`~physpose_torch.losses.PhysicsLoss`.
+            callback: called before each step with step, flat poses and terms of the images still running.
+
+        Raises:
+            InvalidInputError: shapes, NaN or non-rigid poses, a covariance that is not positive definite.
+        """
+        check_poses(poses, scene)
+        leading = poses.shape[:-3]
+        with (
+            torch.inference_mode(False),
+            torch.enable_grad(),
+            torch.autocast(poses.device.type, enabled=False),
+        ):
+            measured = poses.detach().clone().double()
+            if measured_covariance is not None:
+                measured_covariance = torch.as_tensor(measured_covariance).detach().clone()
+            precision = check_precision(measured, scene, measured_covariance, self.config.physics)
+            covariance = torch.linalg.inv(precision)
+            many = scene if leading.numel() == 1 else Scene.cat([scene] * leading.numel())
+            flat = measured.reshape(-1, 4, 4)
+            acts = acting(scene, scores).repeat(leading.numel())
+            result = descend(flat, many, covariance.reshape(-1, 6, 6), acts, self.config, callback)
+            refined = result.poses.reshape(measured.shape)
+            with torch.no_grad():
+                terms = self.loss(
+                    refined, scene, measured=measured, measured_covariance=measured_covariance, scores=scores
+                )
+            report = physics_report(refined, scene, scores=scores, backend=self.config.physics.backend)
+        images = (*leading, scene.n_images)
+        trajectory = result.trajectory
+        if trajectory is not None:
+            trajectory = trajectory.reshape(len(trajectory), *measured.shape).to(poses.dtype)
+        return Refinement(
+            poses=refined.to(poses.dtype),
+            report=report,
+            terms=PhysicsTerms(*(x.to(poses.dtype) for x in terms)),
+            trajectory=trajectory,
+            steps=result.steps.reshape(images),
+            converged=result.converged.reshape(images),
+            image=scene.image,
+        )

@@ -1,0 +1,113 @@
+"""What a robot would ask of a set of poses: how deep objects are inside each other, how high above their support."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from physpose_torch.contacts import find_contacts, find_drops
+from physpose_torch.losses import acting, check_poses
+from physpose_torch.scene import Scene
+
+__all__ = ["PhysicsReport", "physics_report"]
+
+REACH = 1.0
+"""[m]; supports farther below than this are not looked for."""
+NOTABLE = 1e-3
+"""[m]; penetrations and gaps above this show in the status."""
+
+
+@dataclass(frozen=True, eq=False)
+class PhysicsReport:
+    """Physical plausibility of each object, measured on convex parts; tensors are (..., N)."""
+
+    penetration_static: Tensor
+    """Deepest penetration into a static body or plane [m], 0 without any."""
+    penetration_object: Tensor
+    """Deepest penetration into another object [m], 0 without any; alternatives of one object are not counted."""
+    gap: Tensor
+    """How far the object can drop before it meets a support [m]; 0 in contact, NaN without gravity, inf: none below."""
+    support: Tensor
+    """What carries it or would: object index, or N + index of a static (bodies first, then planes); -1: nothing."""
+    labels: tuple[str, ...]
+    """Label of each object."""
+
+    @property
+    def penetration(self) -> Tensor:
+        """The deeper of the two penetrations [m]."""
+        return torch.maximum(self.penetration_static, self.penetration_object)
+
+    @property
+    def status(self) -> list[str]:
+        """``penetrating``, ``floating``, ``resting``, ``unsupported`` or ``free`` (no gravity), flat over (..., N)."""
+        words = []
+        for depth, gap in zip(self.penetration.reshape(-1).tolist(), self.gap.reshape(-1).tolist(), strict=True):
+            if depth > NOTABLE:
+                words.append("penetrating")
+            elif gap != gap:
+                words.append("free")
+            elif gap == float("inf"):
+                words.append("unsupported")
+            else:
+                words.append("floating" if gap > NOTABLE else "resting")
+        return words
+
+    def __str__(self) -> str:
+        rows = [f"{'object':20s} {'in static':>10s} {'in object':>10s} {'gap':>8s}  status   [mm]"]
+        columns = (self.penetration_static, self.penetration_object, self.gap)
+        values = [x.reshape(-1).tolist() for x in columns]
+        repeat = len(values[0]) // max(len(self.labels), 1)
+        for label, deep, inside, gap, status in zip(self.labels * repeat, *values, self.status, strict=True):
+            rows.append(f"{label:20s} {1e3 * deep:10.2f} {1e3 * inside:10.2f} {1e3 * gap:8.2f}  {status}")
+        return "\n".join(rows)
+
+
+def physics_report(
+    poses: Tensor, scene: Scene, *, scores: Tensor | None = None, backend: str = "auto"
+) -> PhysicsReport:
+    """Measure poses without changing them.
+
+    Args:
+        poses: T_camera_object, (..., N, 4, 4) [m].
+        scene: the N objects, statics and gravity.
+        scores: (N,), see :class:`physpose_torch.losses.PhysicsLoss`.
+        backend: distance backend.
+
+    Raises:
+        InvalidInputError: shapes, NaN or non-rigid poses.
+    """
+    poses = check_poses(poses, scene)
+    n = len(scene)
+    leading = poses.shape[:-3]
+    with torch.inference_mode(False), torch.no_grad():
+        flat = poses.detach().clone().double().reshape(-1, 4, 4)
+        many = Scene.cat([scene] * leading.numel())
+        acts = acting(scene, scores).repeat(leading.numel())
+        contacts = find_contacts(flat, many, acts=acts, backend=backend)
+        depth = (-contacts.distance).clamp_min(0.0)
+        first, second = contacts.pair_first[contacts.pair], contacts.pair_second[contacts.pair]
+        static = second >= len(many)
+        felt_first, felt_second = contacts.moves_first[contacts.pair], contacts.moves_second[contacts.pair]
+        in_static, in_object = flat.new_zeros(len(many)), flat.new_zeros(len(many))
+        in_static = in_static.scatter_reduce(0, first[static], depth[static], "amax")
+        for who, felt in ((first, felt_first), (second, felt_second)):
+            among = ~static & felt
+            in_object = in_object.scatter_reduce(0, who[among], depth[among], "amax")
+        drops = find_drops(flat, many, acts=acts, reach=REACH, backend=backend)
+        falls = (many.gravity != 0).any(-1)[many.image].to(flat.device)
+        gap = torch.where(falls, drops.height, torch.nan)
+        support = torch.where(falls, drops.support, -1)
+        copy = torch.arange(leading.numel(), device=flat.device).repeat_interleave(n)
+        support = _own_numbers(support, copy, n, len(scene.static_bodies), len(scene.planes), leading.numel())
+    shape = poses.shape[:-2]
+    in_static, in_object, gap = (x.reshape(shape).to(poses.dtype) for x in (in_static, in_object, gap))
+    return PhysicsReport(in_static, in_object, gap, support.reshape(shape), tuple(scene.labels))
+
+
+def _own_numbers(support: Tensor, copy: Tensor, n: int, bodies: int, planes: int, copies: int) -> Tensor:
+    """Entity numbers of a scene repeated ``copies`` times, as numbers of the one scene."""
+    body = n * copies
+    plane = body + bodies * copies
+    own = torch.where(support >= plane, support - plane - copy * planes + n + bodies, support - copy * n)
+    own = torch.where((support >= body) & (support < plane), support - body - copy * bodies + n, own)
+    return torch.where(support < 0, -1, own)

@@ -1,0 +1,273 @@
+"""What is in the images: movable objects, static bodies and planes, gravity; many images flat in one batch."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from physpose_torch import se3
+from physpose_torch.errors import InvalidInputError
+from physpose_torch.geometry.body import Body, Plane
+from physpose_torch.geometry.convex import ConvexParts
+
+__all__ = ["Scene", "Static"]
+
+
+@dataclass(frozen=True, eq=False)
+class Static:
+    """Something that does not move, in one image."""
+
+    shape: Body | Plane
+    """A body, or a plane in the camera frame."""
+    T_camera_body: Tensor | None = None
+    """(4, 4) pose of a body [m]; may require grad (a robot's links, say). None for a plane."""
+    image: int = 0
+    """Index of the image that it is in."""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.shape, Plane):
+            if self.T_camera_body is not None:
+                raise InvalidInputError("a static Plane is given in the camera frame and takes no T_camera_body")
+        elif isinstance(self.shape, Body):
+            if self.T_camera_body is None:
+                raise InvalidInputError(f"static body {self.shape.label!r} needs its pose T_camera_body (4, 4)")
+            if self.T_camera_body.shape != (4, 4):
+                raise InvalidInputError(
+                    f"static body {self.shape.label!r}: T_camera_body has shape {tuple(self.T_camera_body.shape)}, "
+                    "expected (4, 4)"
+                )
+            se3.check_rigid(self.T_camera_body, f"T_camera_body of static {self.shape.label!r}")
+        else:
+            raise InvalidInputError(f"Static.shape is a {type(self.shape).__name__}, expected a Body or a Plane")
+
+
+class Scene:
+    """Objects of one or many images, and what they must not run into.
+
+    Batching is flat: the N objects of all images stand in one sequence, ``image`` says which image each is in.
+
+    Args:
+        objects: N movable bodies; one :class:`Body` may stand here many times.
+        statics: static bodies and planes.
+        gravity: unit vector(s) pointing down in the camera frame, (3,) or (I, 3); None, or a row of zeros: unknown.
+        image: (N,) long, the image of each object; None: all in image 0.
+        n_images: number of images I; None: as many as ``image`` and ``statics`` name.
+        same_object: (N,) long; objects with one number are alternative estimates of one physical object, and never push
+            each other. None: all are different.
+
+    Raises:
+        InvalidInputError: lengths, indices or gravity do not fit.
+    """
+
+    def __init__(
+        self,
+        objects: Sequence[Body],
+        statics: Sequence[Static] = (),
+        *,
+        gravity: Tensor | None = None,
+        image: Tensor | None = None,
+        n_images: int | None = None,
+        same_object: Tensor | None = None,
+    ) -> None:
+        self.objects = tuple(objects)
+        self.statics = tuple(statics)
+        n = len(self.objects)
+        for i, body in enumerate(self.objects):
+            if not isinstance(body, Body):
+                raise InvalidInputError(f"objects[{i}] is a {type(body).__name__}, expected a Body")
+        self.image = _index(image, n, "image") if image is not None else torch.zeros(n, dtype=torch.long)
+        last = max([int(self.image.max()) if n else -1, *(s.image for s in self.statics)], default=-1)
+        self.n_images = max(last + 1, 1 if image is None else 0) if n_images is None else int(n_images)
+        if last >= self.n_images or any(s.image < 0 for s in self.statics):
+            raise InvalidInputError(f"an object or static is in image {last}, but n_images = {self.n_images}")
+        self.same_object = _index(same_object, n, "same_object") if same_object is not None else torch.arange(n)
+        self.gravity = self._checked_gravity(gravity)
+
+    @classmethod
+    def tabletop(cls, objects: Sequence[Body], plane: Plane) -> "Scene":
+        """One image of objects on a horizontal table: gravity is the plane's normal, downwards."""
+        return cls(objects, [Static(plane)], gravity=-plane.normal.detach())
+
+    @classmethod
+    def cat(cls, scenes: Sequence["Scene"]) -> "Scene":
+        """Many scenes as one batch; images, statics and gravity move along."""
+        objects, statics, gravity, image, same, images, n = [], [], [], [], [], 0, 0
+        for s in scenes:
+            objects += s.objects
+            statics += [Static(x.shape, x.T_camera_body, x.image + images) for x in s.statics]
+            gravity.append(s.gravity.double().cpu())
+            image.append(s.image + images)
+            same.append(s.same_object + n)
+            images, n = images + s.n_images, n + len(s.objects)
+        if not scenes:
+            return cls((), n_images=0)
+        return cls(
+            objects,
+            statics,
+            gravity=torch.cat(gravity),
+            image=torch.cat(image),
+            n_images=images,
+            same_object=torch.cat(same),
+        )
+
+    def select(self, images: Tensor) -> tuple["Scene", Tensor]:
+        """The scene of some images (K,) long, renumbered in that order, and the indices (M,) of their objects here."""
+        images = torch.as_tensor(images, dtype=torch.long)
+        new = torch.full((self.n_images,), -1)
+        new[images] = torch.arange(len(images))
+        rows = (new[self.image] >= 0).nonzero()[:, 0]
+        scene = Scene(
+            [self.objects[i] for i in rows.tolist()],
+            [Static(s.shape, s.T_camera_body, int(new[s.image])) for s in self.statics if new[s.image] >= 0],
+            gravity=self.gravity[images],
+            image=new[self.image[rows]],
+            n_images=len(images),
+            same_object=self.same_object[rows],
+        )
+        return scene, rows
+
+    def __len__(self) -> int:
+        return len(self.objects)
+
+    def __repr__(self) -> str:
+        return f"Scene({len(self.objects)} objects, {len(self.statics)} statics, {self.n_images} images)"
+
+    @property
+    def labels(self) -> list[str]:
+        return [body.label for body in self.objects]
+
+    # ---- packed views: entities are the objects, then the static bodies; an instance is a part of an entity
+
+    @cached_property
+    def static_bodies(self) -> list[Static]:
+        return [s for s in self.statics if isinstance(s.shape, Body)]
+
+    @cached_property
+    def planes(self) -> list[Static]:
+        return [s for s in self.statics if isinstance(s.shape, Plane)]
+
+    @cached_property
+    def _unique(self) -> tuple[list[Body], Tensor]:
+        bodies: dict[int, int] = {}
+        unique: list[Body] = []
+        index = []
+        for body in [*self.objects, *(s.shape for s in self.static_bodies)]:
+            if id(body) not in bodies:
+                bodies[id(body)] = len(unique)
+                unique.append(body)
+            index.append(bodies[id(body)])
+        return unique, torch.tensor(index, dtype=torch.long)
+
+    @cached_property
+    def parts(self) -> ConvexParts:
+        """Convex parts of the different bodies, each body once."""
+        return ConvexParts.cat([b.parts for b in self._unique[0]])
+
+    @cached_property
+    def entity_image(self) -> Tensor:
+        """(N + S,) image of every object and static body."""
+        return torch.cat([self.image, torch.tensor([s.image for s in self.static_bodies], dtype=torch.long)])
+
+    @cached_property
+    def instance_start(self) -> Tensor:
+        """(N + S + 1,) long: entity e has the instances ``instance_start[e]:instance_start[e + 1]``."""
+        counts = self.parts.part_start.diff()[self._unique[1]]
+        return torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+
+    @cached_property
+    def instance_entity(self) -> Tensor:
+        """(Q,) entity of every part instance."""
+        return torch.repeat_interleave(torch.arange(len(self._unique[1])), self.instance_start.diff())
+
+    @cached_property
+    def instance_part(self) -> Tensor:
+        """(Q,) index of every instance into :attr:`parts`."""
+        first = self.parts.part_start[self._unique[1]]
+        within = torch.arange(len(self.instance_entity)) - self.instance_start[self.instance_entity]
+        return first[self.instance_entity] + within
+
+    @cached_property
+    def plane_image(self) -> Tensor:
+        """(L,) image of every plane."""
+        return torch.tensor([s.image for s in self.planes], dtype=torch.long)
+
+    @cached_property
+    def plane_normal(self) -> Tensor:
+        """(L, 3), float64."""
+        return _stack([s.shape.normal for s in self.planes], (0, 3))
+
+    @cached_property
+    def plane_offset(self) -> Tensor:
+        """(L,) [m], float64."""
+        return _stack([s.shape.offset for s in self.planes], (0,))
+
+    @cached_property
+    def object_center(self) -> Tensor:
+        """(N, 3) centre of the bounds of each object, object frame [m]."""
+        return _stack([b.center for b in self._unique[0]], (0, 3))[self._unique[1][: len(self)]]
+
+    @cached_property
+    def object_radius(self) -> Tensor:
+        """(N,) radius of each object about :attr:`object_center` [m]."""
+        radius = torch.tensor([b.radius for b in self._unique[0]], dtype=torch.float64)
+        return radius[self._unique[1][: len(self)]]
+
+    @cached_property
+    def entity_pairs(self) -> Tensor:
+        """(E, 2) pairs of entities that may meet: of one image, at least one movable, not alternatives of one object."""
+        n = len(self)
+        order = torch.argsort(self.entity_image, stable=True)
+        pairs = []
+        counts = torch.bincount(self.entity_image, minlength=self.n_images).tolist()
+        for members in order.split(counts):
+            i, j = torch.triu_indices(len(members), len(members), 1)
+            pairs.append(torch.stack([members[i], members[j]], dim=1))
+        pairs = torch.cat([torch.zeros(0, 2, dtype=torch.long), *pairs]).sort(dim=1).values
+        movable = pairs[:, 0] < n
+        same = torch.full((len(self.entity_image),), -1)
+        same[:n] = self.same_object
+        different = (same[pairs[:, 0]] != same[pairs[:, 1]]) | (pairs[:, 1] >= n)
+        return pairs[movable & different]
+
+    @cached_property
+    def plane_pairs(self) -> Tensor:
+        """(E, 2) pairs (object, plane) of one image."""
+        i, l = (self.image[:, None] == self.plane_image[None]).nonzero(as_tuple=True)
+        return torch.stack([i, l], dim=1)
+
+    def entity_poses(self, poses: Tensor) -> Tensor:
+        """(N + S, 4, 4): the objects' poses, then those of the static bodies."""
+        if not self.static_bodies:
+            return poses
+        return torch.cat([poses, torch.stack([s.T_camera_body.to(poses) for s in self.static_bodies])])
+
+    def _checked_gravity(self, gravity: Tensor | None) -> Tensor:
+        if gravity is None:
+            return torch.zeros(self.n_images, 3, dtype=torch.float64)
+        gravity = torch.as_tensor(gravity, dtype=torch.float64)
+        if gravity.shape == (3,):
+            gravity = gravity.expand(self.n_images, 3)
+        if gravity.shape != (self.n_images, 3) or not bool(gravity.detach().isfinite().all()):
+            raise InvalidInputError(
+                f"gravity has shape {tuple(gravity.shape)}, expected finite (3,) or ({self.n_images}, 3)"
+            )
+        length = torch.linalg.vector_norm(gravity.detach(), dim=-1)
+        if bool((((length - 1.0).abs() > 1e-3) & (length > 0)).any()):
+            raise InvalidInputError(f"gravity has lengths {length.tolist()}, expected unit vectors pointing down")
+        return torch.nn.functional.normalize(gravity, dim=-1)
+
+
+def _index(value: Tensor, n: int, name: str) -> Tensor:
+    value = torch.as_tensor(value)
+    if value.shape != (n,) or value.is_floating_point() or value.dtype == torch.bool:
+        raise InvalidInputError(f"{name} has shape {tuple(value.shape)} and dtype {value.dtype}, expected ({n},) integers")
+    value = value.long().cpu()
+    if n and int(value.min()) < 0:
+        raise InvalidInputError(f"{name} has negative entries")
+    return value
+
+
+def _stack(values: list[Tensor], shape: tuple[int, ...]) -> Tensor:
+    return torch.stack([v.double() for v in values]) if values else torch.zeros(shape, dtype=torch.float64)
