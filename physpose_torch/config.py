@@ -11,16 +11,18 @@ __all__ = ["PhysicsConfig", "RefinerConfig", "Smoothing"]
 def _check_positive(config: object, *names: str) -> None:
     for name in names:
         if not getattr(config, name) > 0:
-            raise InvalidInputError(f"{type(config).__name__}.{name} = {getattr(config, name)}, expected a positive number")
+            raise InvalidInputError(
+                f"{type(config).__name__}.{name} = {getattr(config, name)}, expected a positive number"
+            )
 
 
 @dataclass(frozen=True)
 class Smoothing:
     """Randomized smoothing of the distance gradient; the distance itself is never smoothed."""
 
-    kind: Literal["gaussian", "gumbel", "ring", "pose"] = "ring"
+    kind: Literal["gaussian", "gumbel", "ring", "pose", "none"] = "ring"
     """``gaussian``: the paper's sampling. ``gumbel``: closed form. ``ring``: the expectation of ``gaussian`` by fixed
-    quadrature. ``pose``: averages the gradient over perturbed poses, the slow reference."""
+    quadrature. ``pose``: averages the gradient over perturbed poses, the slow reference. ``none``: the exact gradient."""
     noise: float = 0.1
     """Standard deviation of the contact direction [rad], for ``gaussian``, ``ring`` and ``pose``."""
     temperature: float = 1e-3
@@ -31,9 +33,11 @@ class Smoothing:
     """Seed of the draws."""
 
     def __post_init__(self) -> None:
-        if self.kind not in ("gaussian", "gumbel", "ring", "pose"):
-            raise InvalidInputError(f"smoothing kind {self.kind!r}: expected gaussian, gumbel, ring or pose")
+        if self.kind not in ("gaussian", "gumbel", "ring", "pose", "none"):
+            raise InvalidInputError(f"smoothing kind {self.kind!r}: expected gaussian, gumbel, ring, pose or none")
         _check_positive(self, "noise", "temperature", "samples")
+        if not isinstance(self.samples, int):
+            raise InvalidInputError(f"Smoothing.samples = {self.samples}, expected an integer")
 
 
 @dataclass(frozen=True)
@@ -46,13 +50,18 @@ class PhysicsConfig:
     """Standard deviation of an estimate along its viewing ray [m], a constant part."""
     sigma_ray_fraction: float = 0.03
     """The part of it that grows with range: RGB estimators misjudge size and depth by a factor."""
+    sigma_depth_common: float = 0.0
+    """Standard deviation of the depth factor that all estimates of one image share; 0: errors are independent."""
     sigma_rotation: float = 0.03
     """Standard deviation of an estimate's rotation per axis [rad]."""
+    robust: float = 9.0
+    """ν of the robust pose cost ½ ν log(1 + m²/ν), m the Mahalanobis distance: an estimate that physics contradicts by
+    more than √ν σ is believed less and less; infinite: the paper's ½ m²."""
     pose_weight: float = 1.0
     """Weight of the pose cost; 0 switches it off."""
-    collision_weight: float = 2000.0
+    collision_weight: float = 500.0
     """Weight ζ_C of the collision cost [1/m]; 0 switches it off."""
-    gravity_weight: float = 500.0
+    gravity_weight: float = 200.0
     """Weight ζ_G of the gravity cost [1/m]; 0 switches it off. Well below ζ_C, so that a stack does not press through."""
     gravity: Literal["support", "paper"] = "support"
     """``support``: how far the object can drop before it meets a support, static or not. ``paper``: mean distance of its
@@ -63,15 +72,23 @@ class PhysicsConfig:
     """An object nearer than this to anything [m] counts as touching it, which switches its gravity off (δ in the paper)."""
     softness: float = 1e-3
     """Penetrations and gaps below this [m] cost quadratically, so that contacts settle; 0 is the paper's hinge."""
-    smoothing: Smoothing | None = Smoothing()
-    """Randomized smoothing of the distance gradients; None for the exact ones."""
+    smoothing: Smoothing = Smoothing()
+    """Randomized smoothing of the distance gradients."""
     backend: str = "auto"
     """Distance backend: ``auto``, or a name in ``physpose_torch.distance.backends()``."""
 
     def __post_init__(self) -> None:
-        _check_positive(self, "sigma_lateral", "sigma_rotation", "gravity_reach")
-        for name in ("sigma_ray", "sigma_ray_fraction", "pose_weight", "collision_weight", "gravity_weight",
-                     "contact_tolerance", "softness"):
+        _check_positive(self, "sigma_lateral", "sigma_rotation", "gravity_reach", "robust")
+        for name in (
+            "sigma_ray",
+            "sigma_ray_fraction",
+            "sigma_depth_common",
+            "pose_weight",
+            "collision_weight",
+            "gravity_weight",
+            "contact_tolerance",
+            "softness",
+        ):
             if not getattr(self, name) >= 0:
                 raise InvalidInputError(f"PhysicsConfig.{name} = {getattr(self, name)}, expected a number >= 0")
         if self.sigma_ray == 0 and self.sigma_ray_fraction == 0:
@@ -112,6 +129,8 @@ class RefinerConfig:
                 f"RefinerConfig.optimizer = {self.optimizer!r}, decay = {self.decay!r}: "
                 "expected 'adam' or 'sgd', and 'cosine' or 'none'"
             )
+        if self.max_gradient is not None:
+            _check_positive(self, "max_gradient")
         if not self.tolerance >= 0:
             raise InvalidInputError(f"RefinerConfig.tolerance = {self.tolerance}, expected a number >= 0 [m]")
 
@@ -127,6 +146,7 @@ class RefinerConfig:
             gravity_weight=1.0,
             gravity="paper",
             softness=0.0,
+            robust=float("inf"),
             smoothing=Smoothing("gaussian"),
         )
         return cls(physics, "sgd", steps=3000, learning_rate=1e-4, decay="none", max_gradient=1.0, tolerance=0.0)

@@ -7,8 +7,9 @@ from torch import Tensor
 
 from physpose_torch.config import Smoothing
 from physpose_torch.distance.autograd import drop_distance, signed_distance
-from physpose_torch.distance.broadphase import instance_bounds, meeting_pairs, part_pairs, pairs_below
+from physpose_torch.distance.broadphase import instance_bounds, meeting_pairs, pairs_below
 from physpose_torch.distance.plane import half_space_distance
+from physpose_torch.distance.smoothing import tangent_basis
 from physpose_torch.scene import Scene
 
 __all__ = ["Contacts", "Drops", "find_contacts", "find_drops", "find_static_gaps"]
@@ -34,6 +35,8 @@ class Contacts(NamedTuple):
     """(D,) bool: the pair acts on its first body (not so if the second one is an alternative that pushes nobody)."""
     moves_second: Tensor
     """(D,) bool, likewise; False for statics."""
+    variance: Tensor
+    """(D,) variance of the static's surface where the first body is [m²]; 0 but for planes with a covariance."""
 
 
 class Drops(NamedTuple):
@@ -45,6 +48,8 @@ class Drops(NamedTuple):
     """(N,) entity that would carry it, numbered as in :class:`Contacts`; -1: none."""
     touching: Tensor
     """(N,) bool: gravity is off because something already carries or touches it."""
+    variance: Tensor
+    """(N,) variance of the support's surface there [m²]; 0 but for planes with a covariance."""
 
 
 def find_contacts(
@@ -83,21 +88,17 @@ def find_contacts(
     ).distance
 
     instance, plane = _plane_instances(scene)
-    below = half_space_distance(
-        T[entity[instance].to(device)],
-        scene.parts,
-        scene.instance_part[instance].to(device),
-        scene.plane_normal.to(poses)[plane],
-        scene.plane_offset.to(poses)[plane],
-        smoothing=smoothing,
-    ).distance
+    below = _above_planes(T, scene, instance, plane, smoothing)
 
     n_entities = len(scene.entity_image)
     ends = torch.stack([torch.cat([first, entity[instance]]), torch.cat([second, plane + n_entities])], dim=1)
     bodies, pair = torch.unique(ends, dim=0, return_inverse=True)
     moves = _moves(bodies[:, 0], bodies[:, 1], acts, n)
+    variance = poses.new_zeros(len(bodies))
+    planar = (bodies[:, 1] >= n_entities).nonzero()[:, 0]
+    variance[planar] = plane_variance(poses, scene, bodies[planar, 0], bodies[planar, 1] - n_entities, acts)
     index = (x.to(device) for x in (pair, bodies[:, 0], bodies[:, 1], *moves))
-    return Contacts(torch.cat([distance, below]), *index)
+    return Contacts(torch.cat([distance, below]), *index, variance)
 
 
 def find_drops(
@@ -111,7 +112,7 @@ def find_drops(
 ) -> Drops:
     """How far each object can fall before it meets a plane, a static body or another object.
 
-    The gradient is the falling object's alone: gravity pulls it down, it does not lift what is below.
+    Among objects the gradient is the falling one's alone: gravity pulls it down, it does not lift what is below.
 
     Args:
         poses, scene, acts, smoothing, backend: as in :func:`find_contacts`.
@@ -121,17 +122,32 @@ def find_drops(
     acts = _all_act(scene, acts)
     T = scene.entity_poses(poses)
     entity, gravity = scene.instance_entity, scene.gravity.to(poses)
+
+    instance, plane = _plane_instances(scene)
+    who_plane = entity[instance]
+    above = _above_planes(T, scene, instance, plane, smoothing)
+    down = gravity[scene.image[who_plane].to(device)]
+    slope = -(scene.plane_normal.to(poses)[plane].detach() * down).sum(-1)
+    above = torch.where(slope >= SUPPORT_SLOPE, above.clamp_min(0.0) / slope.clamp_min(SUPPORT_SLOPE), torch.inf)
+    above = torch.where(above <= reach, above, torch.inf)
+
+    # only what may stop an object before its plane does is looked at
+    to_plane = _least(above.detach(), who_plane.to(device), n)[0].clamp_max(reach).cpu()
     falls = (scene.gravity != 0).any(-1)
     both_ways = torch.cat([scene.entity_pairs, scene.entity_pairs.flip(1)])
+    both_ways = both_ways[both_ways[:, 0] < n]
     carries = torch.ones(len(scene.entity_image), dtype=torch.bool)
     carries[:n] = acts
-    both_ways = both_ways[(both_ways[:, 0] < n) & carries[both_ways[:, 1]] & falls[scene.entity_image[both_ways[:, 0]]]]
-    pairs = pairs_below(_bounds(T, scene), entity, scene.instance_start, both_ways, reach=reach)
+    both_ways = both_ways[
+        carries[both_ways[:, 1]] & falls[scene.image[both_ways[:, 0]]] & (to_plane[both_ways[:, 0]] > 0)
+    ]
+    far = torch.cat([to_plane, to_plane.new_zeros(len(scene.entity_image) - n)])
+    pairs = pairs_below(_bounds(T, scene), entity, scene.instance_start, both_ways, reach=far)
     who, onto = entity[pairs[:, 0]], entity[pairs[:, 1]]
-    down = gravity[scene.image.to(device)[who.to(device)]]
+    down = gravity[scene.image[who].to(device)]
     fall = drop_distance(
         _gather(T, who, torch.ones_like(who, dtype=torch.bool)),
-        _gather(T, onto, torch.zeros_like(onto, dtype=torch.bool)),
+        _gather(T, onto, onto >= n),
         scene.parts,
         scene.instance_part[pairs],
         down,
@@ -142,22 +158,6 @@ def find_drops(
     carried = (fall.normal * down).sum(-1) >= SUPPORT_SLOPE
     height = torch.where(carried, fall.distance, torch.inf)
 
-    instance, plane = _plane_instances(scene)
-    who_plane = entity[instance]
-    down = gravity[scene.image.to(device)[who_plane.to(device)]]
-    normal = scene.plane_normal.to(poses)[plane]
-    above = half_space_distance(
-        T[who_plane.to(device)],
-        scene.parts,
-        scene.instance_part[instance].to(device),
-        normal,
-        scene.plane_offset.to(poses)[plane],
-        smoothing=smoothing,
-    ).distance
-    slope = -(normal.detach() * down).sum(-1)
-    above = torch.where(slope >= SUPPORT_SLOPE, above.clamp_min(0.0) / slope.clamp_min(SUPPORT_SLOPE), torch.inf)
-    above = torch.where(above <= reach, above, torch.inf)
-
     height = torch.cat([height, above])
     who = torch.cat([who, who_plane]).to(device)
     onto = torch.cat([onto, plane + len(scene.entity_image)]).to(device)
@@ -165,7 +165,7 @@ def find_drops(
     found = least.isfinite()
     lowest = torch.cat([height, height.new_full((1,), torch.inf)])[torch.where(found, which, len(height))]
     support = torch.where(found, torch.cat([onto, onto.new_full((1,), -1)])[torch.where(found, which, len(onto))], -1)
-    return Drops(lowest, support, least <= 0.0)
+    return Drops(lowest, support, least <= 0.0, _support_variance(poses, scene, support, acts))
 
 
 def find_static_gaps(
@@ -173,6 +173,7 @@ def find_static_gaps(
     scene: Scene,
     contacts: Contacts,
     *,
+    acts: Tensor | None = None,
     tolerance: float,
     smoothing: Smoothing | None = None,
     backend: str = "auto",
@@ -180,7 +181,7 @@ def find_static_gaps(
     """The paper's gravity: mean positive distance of an object's parts to the static part nearest below (Eq. 9).
 
     Args:
-        poses, scene, smoothing, backend: as in :func:`find_contacts`.
+        poses, scene, acts, smoothing, backend: as in :func:`find_contacts`.
         contacts: those of the same poses, with a margin of at least ``tolerance``.
         tolerance: an object any part of which is nearer than this to anything [m] feels no gravity.
     """
@@ -195,22 +196,28 @@ def find_static_gaps(
         pairs = pairs_below(_bounds(T, scene), entity, start, static_pairs, reach=FAR)
         who = entity[pairs[:, 0]].to(device)
         down = gravity[scene.image.to(device)[who]]
-        fall = drop_distance(T[who], T[entity[pairs[:, 1]].to(device)], scene.parts, scene.instance_part[pairs], down,
-                             limit=FAR, backend=backend)
+        fall = drop_distance(
+            T[who],
+            T[entity[pairs[:, 1]].to(device)],
+            scene.parts,
+            scene.instance_part[pairs],
+            down,
+            limit=FAR,
+            backend=backend,
+        )
         height = torch.where((fall.normal * down).sum(-1) >= SUPPORT_SLOPE, fall.distance, torch.inf)
         plane_pairs = scene.plane_pairs[falls[scene.image[scene.plane_pairs[:, 0]]]]
         # all parts of the object against each plane of its image: the nearest part decides which static part is B
         instance, plane = _plane_instances(scene, plane_pairs)
-        above = half_space_distance(
-            T[entity[instance].to(device)], scene.parts, scene.instance_part[instance].to(device),
-            scene.plane_normal.to(poses)[plane], scene.plane_offset.to(poses)[plane],
-        ).distance
+        above = _above_planes(T, scene, instance, plane, None)
         candidate_who = torch.cat([who, entity[instance].to(device)])
         n_instances = len(entity)
         candidate = torch.cat([pairs[:, 1], plane + n_instances]).to(device)
         least, which = _least(torch.cat([height, above.clamp_min(0.0)]), candidate_who, n)
         found = least.isfinite()
-        below = torch.where(found, torch.cat([candidate, candidate.new_full((1,), -1)])[torch.where(found, which, -1)], -1)
+        below = torch.where(
+            found, torch.cat([candidate, candidate.new_full((1,), -1)])[torch.where(found, which, -1)], -1
+        )
 
     chosen = below[entity[: int(start[n])].to(device)].cpu()  # what each object's instance is measured against
     instance = torch.arange(int(start[n]))
@@ -218,35 +225,59 @@ def find_static_gaps(
     on_plane = (chosen >= n_instances).nonzero()[:, 0]
     to_body = signed_distance(
         T[entity[on_body].to(device)],
-        T[entity[chosen[on_body]].to(device)].detach(),
+        T[entity[chosen[on_body]].to(device)],
         scene.parts,
         scene.instance_part[torch.stack([on_body, chosen[on_body]], dim=1)],
         smoothing=smoothing,
         backend=backend,
     ).distance
-    plane = chosen[on_plane] - n_instances
-    to_plane = half_space_distance(
-        T[entity[on_plane].to(device)],
-        scene.parts,
-        scene.instance_part[on_plane].to(device),
-        scene.plane_normal.to(poses)[plane],
-        scene.plane_offset.to(poses)[plane],
-        smoothing=smoothing,
-    ).distance
+    to_plane = _above_planes(T, scene, on_plane, chosen[on_plane] - n_instances, smoothing)
     gap = poses.new_zeros(len(instance))
     gap = gap.index_put((on_body.to(device),), to_body).index_put((on_plane.to(device),), to_plane).clamp_min(0.0)
     count = start.diff()[:n].to(poses)
     mean = poses.new_zeros(n).index_add(0, entity[: len(instance)].to(device), gap) / count
-    nearest = _least(contacts.distance.detach(), contacts.pair_first[contacts.pair], n)[0]
-    movable = contacts.pair_second < n
-    on_second = movable[contacts.pair]
-    other = _least(contacts.distance.detach()[on_second], contacts.pair_second[contacts.pair][on_second], n)[0]
+    # an alternative that pushes nobody does not hold anybody up either
+    nearest = poses.new_full((n,), torch.inf)
+    for who, felt in ((contacts.pair_first, contacts.moves_first), (contacts.pair_second, contacts.moves_second)):
+        felt = felt[contacts.pair]
+        nearest = nearest.scatter_reduce(0, who[contacts.pair][felt], contacts.distance.detach()[felt], "amin")
     height = torch.where(below >= 0, mean, torch.inf)
-    entity_below = torch.where(
-        below >= n_instances, below - n_instances + len(scene.entity_image),
-        torch.where(below >= 0, entity.to(device)[below.clamp(0, n_instances - 1)], -1),
-    ) if n_instances else below
-    return Drops(height, entity_below, torch.minimum(nearest, other) < tolerance)
+    entity_below = (
+        torch.where(
+            below >= n_instances,
+            below - n_instances + len(scene.entity_image),
+            torch.where(below >= 0, entity.to(device)[below.clamp(0, n_instances - 1)], -1),
+        )
+        if n_instances
+        else below
+    )
+    touching = nearest < tolerance
+    return Drops(height, entity_below, touching, _support_variance(poses, scene, entity_below, _all_act(scene, acts)))
+
+
+def plane_variance(poses: Tensor, scene: Scene, who: Tensor, plane: Tensor, acts: Tensor) -> Tensor:
+    """Variance (E,) of the height of planes at objects [m²]: the offset's, and the tilts' times the distance from the
+    point under the centre of the image's objects that act, to which a plane's covariance refers."""
+    if not scene.plane_uncertain:
+        return poses.new_zeros(len(who))
+    with torch.no_grad():
+        origin = (poses[:, :3, :3] @ scene.object_center.to(poses)[:, :, None])[:, :, 0] + poses[:, :3, 3]
+        image = scene.image.to(poses.device)
+        weight = acts.to(poses)
+        count = poses.new_zeros(scene.n_images).index_add(0, image, weight).clamp_min(1)
+        middle = poses.new_zeros(scene.n_images, 3).index_add(0, image, weight[:, None] * origin) / count[:, None]
+        who = who.to(poses.device)
+        lever = tangent_basis(scene.plane_normal.to(poses)[plane]) @ (origin[who] - middle[image[who]])[:, :, None]
+        jacobian = torch.cat([lever[:, :, 0], torch.ones_like(lever[:, :1, 0])], dim=1)
+        return torch.einsum("ei,eij,ej->e", jacobian, scene.plane_covariance.to(poses)[plane], jacobian)
+
+
+def _support_variance(poses: Tensor, scene: Scene, support: Tensor, acts: Tensor) -> Tensor:
+    n_entities = len(scene.entity_image)
+    who = (support >= n_entities).nonzero()[:, 0]
+    variance = poses.new_zeros(len(support))
+    variance[who] = plane_variance(poses, scene, who, (support[who] - n_entities).cpu(), acts)
+    return variance
 
 
 def _bounds(T: Tensor, scene: Scene):
@@ -259,6 +290,18 @@ def _bounds(T: Tensor, scene: Scene):
             scene.gravity.to(T)[scene.entity_image[entity].to(T.device)],
         )
     return type(bounds)(*(x.cpu() for x in bounds))
+
+
+def _above_planes(T: Tensor, scene: Scene, instance: Tensor, plane: Tensor, smoothing: Smoothing | None) -> Tensor:
+    """Signed distances (E,) of part instances to planes."""
+    return half_space_distance(
+        T[scene.instance_entity[instance].to(T.device)],
+        scene.parts,
+        scene.instance_part[instance].to(T.device),
+        scene.plane_normal.to(T)[plane],
+        scene.plane_offset.to(T)[plane],
+        smoothing=smoothing,
+    ).distance
 
 
 def _all_act(scene: Scene, acts: Tensor | None) -> Tensor:

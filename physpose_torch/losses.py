@@ -9,6 +9,7 @@ from physpose_torch import se3
 from physpose_torch.config import PhysicsConfig
 from physpose_torch.contacts import Contacts, Drops, find_contacts, find_drops, find_static_gaps
 from physpose_torch.errors import InvalidInputError
+from physpose_torch.prior import PosePrior, common_depth, make_prior, pose_covariance
 from physpose_torch.scene import Scene
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "gravity_loss",
     "pose_covariance",
     "pose_loss",
+    "prior_loss",
     "soft_hinge",
 ]
 
@@ -71,51 +73,49 @@ def pose_loss(poses: Tensor, measured: Tensor, precision: Tensor) -> Tensor:
     return _Mahalanobis.apply(*torch.broadcast_tensors(poses, measured), precision)
 
 
-def pose_covariance(measured: Tensor, center: Tensor, config: PhysicsConfig) -> Tensor:
-    """Covariance of estimates that are less sure along the viewing ray than across it (paper Sec. 3.1).
+def prior_loss(poses: Tensor, prior: PosePrior) -> Tensor:
+    """Robust pose cost (N,) of flat poses (N, 4, 4); the depth factor that an image's estimates share is eliminated.
 
-    Args:
-        measured: T̃_camera_object (..., N, 4, 4) [m].
-        center: (N, 3) point of the object that the ray goes to [m].
-        config: its sigma fields.
-
-    Returns:
-        (..., N, 6, 6): translation in the camera frame [m²], rotation (isotropic) in the object frame [rad²].
+    With the best factor s the estimates move by s along their rays; its own cost ½ s²/σ² is spread over the objects. The
+    gradient is that at fixed s, which is exact at the optimum.
     """
-    ray = (measured[..., :3, :3] @ center.to(measured)[..., None])[..., 0] + measured[..., :3, 3]
-    distance = torch.linalg.vector_norm(ray, dim=-1)[..., None, None]
-    direction = torch.nn.functional.normalize(ray, dim=-1)
-    along = direction[..., :, None] * direction[..., None, :]
-    eye = torch.eye(3, dtype=measured.dtype, device=measured.device)
-    variance = config.sigma_ray**2 + (config.sigma_ray_fraction * distance) ** 2
-    covariance = torch.zeros(*measured.shape[:-2], 6, 6, dtype=measured.dtype, device=measured.device)
-    covariance[..., :3, :3] = config.sigma_lateral**2 * (eye - along) + variance * along
-    covariance[..., 3:, 3:] = config.sigma_rotation**2 * eye
-    return covariance
+    measured, own = prior.measured, poses.new_zeros(len(poses))
+    if prior.sigma_common > 0:
+        with torch.no_grad():
+            factor = common_depth(se3.residual(poses, prior.measured), prior)
+            measured = prior.measured.clone()
+            measured[:, :3, 3] += factor[prior.image, None] * prior.ray
+            count = torch.bincount(prior.image[prior.acts], minlength=prior.n_images)[prior.image]
+            own = prior.acts * 0.5 * (factor[prior.image] / prior.sigma_common) ** 2 / count
+    cost = pose_loss(poses, measured, prior.precision)
+    if prior.robust != torch.inf:
+        cost = 0.5 * prior.robust * torch.log1p(2 * cost / prior.robust)
+    return cost + own
 
 
-def soft_hinge(x: Tensor, softness: float) -> Tensor:
-    """max(0, x) with a quadratic start: x²/2w for 0 < x < w, then x - w/2; ``softness`` w in the unit of x."""
-    positive = x.clamp_min(0)
-    if softness == 0:
-        return positive
-    return torch.where(positive < softness, positive * positive / (2 * softness), positive - 0.5 * softness)
+def soft_hinge(x: Tensor, softness: Tensor | float) -> Tensor:
+    """max(0, x) with a quadratic start: x²/2w for 0 < x < w, then x - w/2; ``softness`` w ≥ 0 in the unit of x."""
+    positive = torch.relu(x)  # no force at exact contact, unlike clamp
+    w = torch.as_tensor(softness, dtype=x.dtype, device=x.device)
+    quadratic = positive * positive / (2 * w.clamp_min(torch.finfo(x.dtype).tiny))
+    return torch.where(positive < w, quadratic, positive - 0.5 * w)
 
 
-def collision_loss(contacts: Contacts, n_objects: int, *, softness: float = 0.0) -> tuple[Tensor, Tensor]:
+def collision_loss(contacts: Contacts, n_objects: int, *, softness: Tensor | float = 0.0) -> tuple[Tensor, Tensor]:
     """Mean penetration of the colliding part pairs of every two bodies, summed over the others (paper Eq. 7-8).
 
     Args:
         contacts: signed distances of part pairs, see :func:`physpose_torch.contacts.find_contacts`.
         n_objects: number of movable objects N.
-        softness: see :func:`soft_hinge` [m]; 0 is the paper's.
+        softness: see :func:`soft_hinge` [m], one or (D,) a pair of bodies; 0 is the paper's.
 
     Returns:
         C_i as printed (N,) [m], in which a pair of movable objects counts for both; and each object's share (N,) [m]
         of the sum in which every pair counts once.
     """
     c = contacts
-    penetration = soft_hinge(-c.distance, softness)
+    softness = torch.as_tensor(softness, dtype=c.distance.dtype, device=c.distance.device)
+    penetration = soft_hinge(-c.distance, softness if softness.ndim == 0 else softness[c.pair])
     n_pairs = len(c.pair_first)
     n_colliding = c.distance.new_zeros(n_pairs).index_add(0, c.pair, (c.distance < 0).to(c.distance))
     cost = c.distance.new_zeros(n_pairs).index_add(0, c.pair, penetration) / n_colliding.clamp_min(1.0)
@@ -127,7 +127,7 @@ def collision_loss(contacts: Contacts, n_objects: int, *, softness: float = 0.0)
     return printed, share
 
 
-def gravity_loss(drops: Drops, *, softness: float = 0.0) -> Tensor:
+def gravity_loss(drops: Drops, *, softness: Tensor | float = 0.0) -> Tensor:
     """Height of each object above what would carry it; none where it touches something or hangs out of reach.
 
     With gaps from :func:`~physpose_torch.contacts.find_static_gaps` it is the paper's Eq. 9; with those of
@@ -181,16 +181,21 @@ class PhysicsLoss(nn.Module):
         leading = poses.shape[:-3]
         hypotheses = leading.numel()
         with torch.autocast(poses.device.type, enabled=False):
-            pose = poses.new_zeros(poses.shape[:-2])
-            if measured is not None:
-                measured = check_poses(measured, scene, "measured").to(poses)
-                precision = check_precision(measured, scene, measured_covariance, self.config)
-                pose = pose_loss(poses, measured, precision)
             flat = poses.reshape(-1, 4, 4)
             many = scene if hypotheses == 1 else Scene.cat([scene] * hypotheses)
             acts = acting(scene, scores).repeat(hypotheses)
+            pose = flat.new_zeros(len(flat))
+            if measured is not None:
+                measured = check_poses(measured, scene, "measured").to(poses)
+                if measured.shape[:-3] not in (leading, ()):
+                    shapes = f"{tuple(measured.shape)}, expected {tuple(poses.shape)}"
+                    raise InvalidInputError(f"measured has shape {shapes}")
+                covariance = flatten_covariance(measured_covariance, poses)
+                prior = make_prior(measured.expand_as(poses).reshape(-1, 4, 4), many, acts, covariance, self.config)
+                pose = prior_loss(flat, prior)
             collision, share, gravity = physics_terms(flat, many, acts, self.config)
         shape = poses.shape[:-2]
+        pose = pose.reshape(shape)
         total = (
             self.config.pose_weight * pose
             + self.config.collision_weight * share.reshape(shape)
@@ -201,18 +206,34 @@ class PhysicsLoss(nn.Module):
 
 def physics_terms(poses: Tensor, scene: Scene, acts: Tensor, config: PhysicsConfig) -> tuple[Tensor, Tensor, Tensor]:
     """C_i as printed, each object's share of the collisions counted once, and G_i; (N,) each, of flat poses (N, 4, 4)."""
-    smoothing, backend = config.smoothing, config.backend
-    contacts = find_contacts(poses, scene, acts=acts, smoothing=smoothing, backend=backend,
-                             margin=config.contact_tolerance if config.gravity == "paper" else 0.0)
-    collision, share = collision_loss(contacts, len(scene), softness=config.softness)
+    smoothing, backend = config.smoothing if config.smoothing.kind != "none" else None, config.backend
+    margin = config.contact_tolerance if config.gravity == "paper" else 0.0
+    contacts = find_contacts(poses, scene, acts=acts, smoothing=smoothing, backend=backend, margin=margin)
+    softness = _contact_softness(contacts.variance, config.collision_weight, config)
+    collision, share = collision_loss(contacts, len(scene), softness=softness)
     if config.gravity_weight == 0 or not bool((scene.gravity != 0).any()):
         return collision, share, poses.new_zeros(len(scene))
     if config.gravity == "paper":
-        drops = find_static_gaps(poses, scene, contacts, tolerance=config.contact_tolerance, smoothing=smoothing,
-                                 backend=backend)
+        drops = find_static_gaps(
+            poses,
+            scene,
+            contacts,
+            acts=acts,
+            tolerance=config.contact_tolerance,
+            smoothing=smoothing,
+            backend=backend,
+        )
     else:
         drops = find_drops(poses, scene, acts=acts, reach=config.gravity_reach, smoothing=smoothing, backend=backend)
-    return collision, share, gravity_loss(drops, softness=config.softness)
+    softness = _contact_softness(drops.variance, config.gravity_weight, config)
+    gravity = gravity_loss(drops, softness=softness)
+    carried = scene.has_static[scene.image].to(poses.device)  # what rests on nothing known is not pulled together
+    return collision, share, torch.where(carried, gravity, torch.zeros_like(gravity))
+
+
+def _contact_softness(variance: Tensor, weight: float, config: PhysicsConfig) -> Tensor:
+    """Softness w of contacts with a surface that is itself uncertain: ζ d²/2w is d²/2σ² for w = ζσ²."""
+    return (weight * variance).clamp_min(config.softness)
 
 
 def acting(scene: Scene, scores: Tensor | None) -> Tensor:
@@ -242,22 +263,15 @@ def check_poses(poses: Tensor, scene: Scene, name: str = "poses") -> Tensor:
     return poses if poses.dtype in (torch.float32, torch.float64) else poses.float()
 
 
-def check_precision(measured: Tensor, scene: Scene, covariance: Tensor | None, config: PhysicsConfig) -> Tensor:
-    """H = Σ⁻¹ (..., N, 6, 6) of given covariances or of the config's sigmas."""
+def flatten_covariance(covariance: Tensor | None, poses: Tensor) -> Tensor | None:
+    """Covariances (..., N, 6, 6) or broadcastable as (M, 6, 6), for poses (..., N, 4, 4)."""
     if covariance is None:
-        covariance = pose_covariance(measured.double(), scene.object_center.to(measured.device), config)
-    else:
-        covariance = torch.as_tensor(covariance, device=measured.device).double()
-        expected = (*measured.shape[:-2], 6, 6)
-        try:
-            covariance = covariance.expand(expected)
-        except RuntimeError as error:
-            raise InvalidInputError(
-                f"measured_covariance has shape {tuple(covariance.shape)}, expected {expected}"
-            ) from error
-    factor, failed = torch.linalg.cholesky_ex(0.5 * (covariance + covariance.mT))
-    bad = (failed != 0) | ~covariance.isfinite().flatten(-2).all(-1)
-    if bool(bad.any()):
-        row = int(bad.reshape(-1).nonzero()[0, 0])
-        raise InvalidInputError(f"measured_covariance of object {row % len(scene)} is not positive definite")
-    return torch.cholesky_inverse(factor).to(measured)
+        return None
+    covariance = torch.as_tensor(covariance).detach()
+    expected = (*poses.shape[:-2], 6, 6)
+    try:
+        return covariance.expand(expected).reshape(-1, 6, 6)
+    except RuntimeError as error:
+        raise InvalidInputError(
+            f"measured_covariance has shape {tuple(covariance.shape)}, expected {expected}"
+        ) from error

@@ -1,18 +1,23 @@
 """The layer to append to a pose estimator: poses in, physically consistent poses out."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 
 from physpose_torch.config import RefinerConfig
-from physpose_torch.losses import PhysicsLoss, PhysicsTerms, acting, check_poses, check_precision
+from physpose_torch.errors import InvalidInputError
+from physpose_torch.losses import PhysicsLoss, PhysicsTerms, acting, check_poses, flatten_covariance
+from physpose_torch.prior import make_prior
 from physpose_torch.report import PhysicsReport, physics_report
 from physpose_torch.scene import Scene
 from physpose_torch.solvers.descent import descend
 
 __all__ = ["PhysPoseRefiner", "Refinement"]
+
+FARTHEST = 100.0
+"""[m]; estimates beyond this are in millimetres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,12 +41,22 @@ class Refinement:
 
     def best(self) -> Tensor:
         """Poses (N, 4, 4) of the hypothesis with the lowest cost, chosen image by image."""
-        poses = self.poses.reshape(-1, *self.poses.shape[-3:])
-        cost = self.terms.total.reshape(len(poses), -1)
+        hypotheses, n = self.steps.shape[:-1].numel(), self.poses.shape[-3]
+        poses, cost = self.poses.reshape(hypotheses, n, 4, 4), self.terms.total.reshape(hypotheses, n)
         image = self.image.to(cost.device)
         per_image = cost.new_zeros(len(poses), self.steps.shape[-1]).index_add(1, image, cost)
         choice = per_image.argmin(0)[image]
         return poses[choice, torch.arange(poses.shape[1], device=poses.device)]
+
+
+def _check_metres(poses: Tensor, scene: Scene) -> None:
+    distance = torch.linalg.vector_norm(poses.detach()[..., :3, 3], dim=-1)
+    if bool((distance > FARTHEST).any()):
+        row = int((distance > FARTHEST).nonzero()[0, -1])
+        raise InvalidInputError(
+            f"poses[..., {row}] ({scene.labels[row]}) is {float(distance.max()):.4g} m from the camera; "
+            "translations are in metres, divide millimetres by 1000"
+        )
 
 
 class PhysPoseRefiner(nn.Module):
@@ -79,6 +94,7 @@ class PhysPoseRefiner(nn.Module):
             InvalidInputError: shapes, NaN or non-rigid poses, a covariance that is not positive definite.
         """
         check_poses(poses, scene)
+        _check_metres(poses, scene)
         leading = poses.shape[:-3]
         with (
             torch.inference_mode(False),
@@ -88,18 +104,19 @@ class PhysPoseRefiner(nn.Module):
             measured = poses.detach().clone().double()
             if measured_covariance is not None:
                 measured_covariance = torch.as_tensor(measured_covariance).detach().clone()
-            precision = check_precision(measured, scene, measured_covariance, self.config.physics)
-            covariance = torch.linalg.inv(precision)
             many = scene if leading.numel() == 1 else Scene.cat([scene] * leading.numel())
-            flat = measured.reshape(-1, 4, 4)
+            covariance = flatten_covariance(measured_covariance, measured)
             acts = acting(scene, scores).repeat(leading.numel())
-            result = descend(flat, many, covariance.reshape(-1, 6, 6), acts, self.config, callback)
+            prior = make_prior(measured.reshape(-1, 4, 4), many, acts, covariance, self.config.physics)
+            result = descend(prior, many, acts, self.config, callback)
             refined = result.poses.reshape(measured.shape)
             with torch.no_grad():
                 terms = self.loss(
                     refined, scene, measured=measured, measured_covariance=measured_covariance, scores=scores
                 )
             report = physics_report(refined, scene, scores=scores, backend=self.config.physics.backend)
+        lengths = ("penetration_static", "penetration_object", "gap")
+        report = replace(report, **{name: getattr(report, name).to(poses.dtype) for name in lengths})
         images = (*leading, scene.n_images)
         trajectory = result.trajectory
         if trajectory is not None:

@@ -77,10 +77,15 @@ class Scene:
         for i, body in enumerate(self.objects):
             if not isinstance(body, Body):
                 raise InvalidInputError(f"objects[{i}] is a {type(body).__name__}, expected a Body")
+        for i, static in enumerate(self.statics):
+            if not isinstance(static, Static):
+                raise InvalidInputError(f"statics[{i}] is a {type(static).__name__}, expected a Static")
+            if static.image < 0:
+                raise InvalidInputError(f"statics[{i}] is in image {static.image}, expected an index >= 0")
         self.image = _index(image, n, "image") if image is not None else torch.zeros(n, dtype=torch.long)
         last = max([int(self.image.max()) if n else -1, *(s.image for s in self.statics)], default=-1)
         self.n_images = max(last + 1, 1 if image is None else 0) if n_images is None else int(n_images)
-        if last >= self.n_images or any(s.image < 0 for s in self.statics):
+        if last >= self.n_images:
             raise InvalidInputError(f"an object or static is in image {last}, but n_images = {self.n_images}")
         self.same_object = _index(same_object, n, "same_object") if same_object is not None else torch.arange(n)
         self.gravity = self._checked_gravity(gravity)
@@ -189,19 +194,38 @@ class Scene:
         return first[self.instance_entity] + within
 
     @cached_property
+    def has_static(self) -> Tensor:
+        """(I,) bool: whether anything static is known in each image."""
+        known = torch.zeros(self.n_images, dtype=torch.bool)
+        known[[s.image for s in self.statics]] = True
+        return known
+
+    @cached_property
     def plane_image(self) -> Tensor:
         """(L,) image of every plane."""
         return torch.tensor([s.image for s in self.planes], dtype=torch.long)
 
-    @cached_property
+    # planes may require grad, and an optimizer may move them in place: not cached
+    @property
     def plane_normal(self) -> Tensor:
         """(L, 3), float64."""
         return _stack([s.shape.normal for s in self.planes], (0, 3))
 
-    @cached_property
+    @property
     def plane_offset(self) -> Tensor:
         """(L,) [m], float64."""
         return _stack([s.shape.offset for s in self.planes], (0,))
+
+    @cached_property
+    def plane_covariance(self) -> Tensor:
+        """(L, 3, 3) of (two tilts [rad], offset [m]), zero for exact planes."""
+        zero = torch.zeros(3, 3, dtype=torch.float64)
+        return _stack([zero if s.shape.covariance is None else s.shape.covariance for s in self.planes], (0, 3, 3))
+
+    @cached_property
+    def plane_uncertain(self) -> bool:
+        """Whether any plane has a covariance."""
+        return any(s.shape.covariance is not None for s in self.planes)
 
     @cached_property
     def object_center(self) -> Tensor:
@@ -234,8 +258,7 @@ class Scene:
     @cached_property
     def plane_pairs(self) -> Tensor:
         """(E, 2) pairs (object, plane) of one image."""
-        i, l = (self.image[:, None] == self.plane_image[None]).nonzero(as_tuple=True)
-        return torch.stack([i, l], dim=1)
+        return (self.image[:, None] == self.plane_image[None]).nonzero()
 
     def entity_poses(self, poses: Tensor) -> Tensor:
         """(N + S, 4, 4): the objects' poses, then those of the static bodies."""
@@ -262,7 +285,9 @@ class Scene:
 def _index(value: Tensor, n: int, name: str) -> Tensor:
     value = torch.as_tensor(value)
     if value.shape != (n,) or value.is_floating_point() or value.dtype == torch.bool:
-        raise InvalidInputError(f"{name} has shape {tuple(value.shape)} and dtype {value.dtype}, expected ({n},) integers")
+        raise InvalidInputError(
+            f"{name} has shape {tuple(value.shape)} and dtype {value.dtype}, expected ({n},) integers"
+        )
     value = value.long().cpu()
     if n and int(value.min()) < 0:
         raise InvalidInputError(f"{name} has negative entries")

@@ -27,7 +27,7 @@ __all__ = [
 ]
 
 RIGID_TOLERANCE = 1e-3
-"""Largest entry of RᵀR - I that still counts as a rotation; float32 networks stay well below, units and scales do not."""
+"""Largest entry of RᵀR - I that still counts as a rotation; float32 networks stay well below, scales do not."""
 
 
 def hat(omega: Tensor) -> Tensor:
@@ -51,7 +51,8 @@ def log_so3(R: Tensor) -> Tensor:
     norm = torch.linalg.vector_norm(vector, dim=-1, keepdim=True)
     small = norm < 1e-7
     angle = 2.0 * torch.atan2(norm, real)
-    return torch.where(small, 2.0 / real.clamp_min(0.5), angle / torch.where(small, torch.ones_like(norm), norm)) * vector
+    factor = torch.where(small, 2.0 / real.clamp_min(0.5), angle / torch.where(small, torch.ones_like(norm), norm))
+    return factor * vector
 
 
 def right_jacobian_inverse(omega: Tensor) -> Tensor:
@@ -86,7 +87,7 @@ def apply(T_a_b: Tensor, x_b: Tensor) -> Tensor:
 
 
 def retract(T: Tensor, xi: Tensor) -> Tensor:
-    """Move T (..., 4, 4) by the tangent step xi (..., 6): translation in the camera frame, rotation in the object frame."""
+    """Move T (..., 4, 4) by xi (..., 6): translation in the camera frame, rotation in the object frame."""
     return from_rotation_translation(T[..., :3, :3] @ exp_so3(xi[..., 3:]), T[..., :3, 3] + xi[..., :3])
 
 
@@ -133,13 +134,15 @@ def check_rigid(T: Tensor, name: str, names: Sequence[str] | None = None) -> Non
         if bool(good.all()):
             return
         row = int((~good).nonzero()[0, 0])
-    where = f"{name}[{', '.join(str(int(i)) for i in torch.unravel_index(torch.tensor(row), T.shape[:-2]))}]" if T.ndim > 2 else name
+    index = torch.unravel_index(torch.tensor(row), T.shape[:-2]) if T.ndim > 2 else ()
+    where = f"{name}[{', '.join(str(int(i)) for i in index)}]" if index else name
     if names is not None:
         where += f" ({names[row % len(names)]})"
     if not bool(finite[row]):
         raise InvalidInputError(f"{where} contains NaN or infinity; drop that estimate before refining")
     if float(bottom[row]) >= RIGID_TOLERANCE:
-        raise InvalidInputError(f"{where} has bottom row {flat[row, 3].tolist()}, expected [0, 0, 0, 1]; is it transposed?")
+        bottom_row = flat[row, 3].tolist()
+        raise InvalidInputError(f"{where} has bottom row {bottom_row}, expected [0, 0, 0, 1]; is it transposed?")
     raise InvalidInputError(
         f"{where} is not rigid: det(R) = {float(det[row]):.3g}, largest entry of RᵀR - I {float(deviation[row]):.2g}; "
         "expected a rotation (det 1). Scales and units belong into Body.from_mesh(scale=...), not into the pose"

@@ -218,6 +218,15 @@ class BopDataset:
         """
         return self._once(("gt", scene_id), lambda: self._read_ground_truth(scene_id))
 
+    @property
+    def targets_path(self) -> Path | None:
+        """The list of targets that was asked for, or the split's own; None if there is none."""
+        if self._targets is None:
+            default = self.path / f"{self.split_path.name.split('_')[0]}_targets_bop19.json"
+            return default if default.is_file() else None
+        path = Path(self._targets)
+        return self.path / path if not path.is_file() and (self.path / path).is_file() else path
+
     @cached_property
     def targets(self) -> list[Target]:
         """What is to be found, from the target list; without one, all instances that are visible to 10 %.
@@ -225,12 +234,8 @@ class BopDataset:
         Raises:
             DataError: The list is missing although it was asked for, or broken.
         """
-        default = self.path / f"{self.split_path.name.split('_')[0]}_targets_bop19.json"
-        path = default if self._targets is None else Path(self._targets)
-        if self._targets is not None and not path.is_file() and (self.path / path).is_file():
-            path = self.path / path
-        if self._targets is not None or path.is_file():
-            return read_targets(path)
+        if self.targets_path is not None:
+            return read_targets(self.targets_path)
         counts: dict[tuple[int, int, int], int] = {}
         for scene_id in self.scene_ids:
             gt = self.ground_truth(scene_id)

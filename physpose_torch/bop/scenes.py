@@ -1,9 +1,8 @@
 """From a BOP result file to scenes and back: one scene an image, with what could not be used set aside."""
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -100,6 +99,7 @@ def image_scenes(
     statics: list[StaticRecord] = (),
     counts: Mapping[tuple[int, int, int], int] | None = None,
     broken: Mapping[tuple[int, int], list[str]] | None = None,
+    wanted: Container[tuple[int, int]] | None = None,
 ) -> list[ImageScene]:
     """One scene for each image that the estimates name, in file order.
 
@@ -111,10 +111,12 @@ def image_scenes(
         statics: static bodies, see :func:`physpose_torch.bop.formats.read_statics`.
         counts: (scene_id, im_id, obj_id) → number of instances, from a targets file.
         broken: images with rows or planes that cannot be used, and why; they are left alone.
+        wanted: (scene_id, im_id) of the images to look at; None: all.
     """
     images: dict[tuple[int, int], list[int]] = {}
     for row, key in enumerate(zip(estimates.scene_id.tolist(), estimates.im_id.tolist(), strict=True)):
-        images.setdefault(key, []).append(row)
+        if wanted is None or key in wanted:
+            images.setdefault(key, []).append(row)
     out = []
     for key, rows in images.items():
         image = ImageScene(*key, np.array(rows), problems=list((broken or {}).get(key, [])))

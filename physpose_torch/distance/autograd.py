@@ -19,6 +19,8 @@ Backend = Callable[[ConvexParts, Tensor, Tensor, Tensor], tuple[Tensor, Tensor, 
 CONTACT = 1e-9
 """[m]; a falling part has arrived when it is this near."""
 DROP_STEPS = 30
+GRAZING = 1e-3
+"""Least n·g that the gradient of a drop is divided by."""
 
 
 def backends() -> list[str]:
@@ -41,8 +43,9 @@ def signed_distance(
 ) -> DistanceResult:
     """Signed distances of pairs of convex parts.
 
-    The gradient is Danskin's: with witness points a, b (body frames) and the normal n from a to b, ∂d/∂T_a = -n ⊗ [a; 1]
-    and ∂d/∂T_b = n ⊗ [b; 1]. With ``smoothing`` the witness points in it are smoothed (paper Sec. 2 and appendix).
+    The gradient is Danskin's: with witness points a, b (body frames) and the normal n from a to b,
+    ∂d/∂T_a = -n ⊗ [a; 1] and ∂d/∂T_b = n ⊗ [b; 1]. With ``smoothing`` the witness points in it are smoothed
+    (paper Sec. 2 and appendix).
 
     Args:
         T_a, T_b: (E, 4, 4) poses of the bodies that the parts belong to, in one frame [m].
@@ -60,7 +63,8 @@ def signed_distance(
             f"T_a {tuple(T_a.shape)}, T_b {tuple(T_b.shape)}, pairs {tuple(pairs.shape)}: "
             "expected (E, 4, 4), (E, 4, 4) and (E, 2)"
         )
-    return DistanceResult(*_SignedDistance.apply(T_a, T_b, parts, pairs, _backend(backend), smoothing))
+    with torch.autocast(T_a.device.type, enabled=False):  # a micrometre is lost in half precision
+        return DistanceResult(*_SignedDistance.apply(T_a, T_b, parts, pairs, _backend(backend), smoothing))
 
 
 def drop_distance(
@@ -77,7 +81,8 @@ def drop_distance(
     """How far parts a can fall along gravity before they meet parts b.
 
     Conservative advancement: the distance along the fall is convex, so stepping by d / (n·g) never overshoots. The
-    gradient is that of the distance at the meeting point divided by n·g (design: h = max over n·g > 0 of the gap / n·g).
+    gradient is that of the distance at the meeting point divided by n·g, because h = max over n·g > 0 of the
+    gap / (n·g); it is zero where the parts overlap.
 
     Args:
         T_a, T_b, parts, pairs, backend, smoothing: as in :func:`signed_distance`.
@@ -107,8 +112,11 @@ def drop_distance(
     gravity_at, T_a_at = gravity[meets], T_a[meets]
     shifted = _moved(T_a_at, fall[meets, None] * gravity_at)
     at = signed_distance(shifted, T_b[meets], parts, pairs[meets], backend=backend, smoothing=smoothing)
-    rate = (at.normal * gravity_at).sum(-1).clamp_min(1e-3)
-    value = fall[meets] + (at.distance - at.distance.detach()) / rate
+    rate = (at.normal * gravity_at).sum(-1)
+    # what is inside already, or slides along, cannot fall any less; the rest is bounded where it only grazes
+    lands = (rate > 0) & (at.distance.detach() >= -CONTACT)
+    slope = torch.where(lands, 1.0 / rate.clamp_min(GRAZING), 0.0)
+    value = fall[meets] + (at.distance - at.distance.detach()) * slope
     out = DistanceResult(fall, torch.zeros_like(gravity), torch.zeros_like(gravity), torch.zeros_like(gravity))
     return DistanceResult(
         out.distance.index_put((meets,), value),
@@ -129,11 +137,7 @@ class _SignedDistance(torch.autograd.Function):
         else:
             n, a, b = normal, point_a, point_b
             if smoothing is not None:
-                masks = [parts.padded_mask[i].to(T_a.device) for i in pairs.unbind(1)]
-                vertices_a, vertices_b = (
-                    se3.apply(T, parts.padded[i].to(T)) for T, i in zip((T_a, T_b), pairs.unbind(1), strict=True)
-                )
-                n, a, b = smoothed_points(vertices_a, masks[0], vertices_b, masks[1], normal, smoothing)
+                n, a, b = _smoothed(T_a, T_b, parts, pairs, normal, smoothing)
             gradient_a, gradient_b = -_outer(n, T_a, a), _outer(n, T_b, b)
         ctx.save_for_backward(gradient_a, gradient_b)
         ctx.mark_non_differentiable(normal, point_a, point_b)
@@ -163,30 +167,42 @@ def _backend(name: str) -> Backend:
 def _query(run: Backend, T_a: Tensor, T_b: Tensor, parts: ConvexParts, pairs: Tensor) -> tuple[Tensor, ...]:
     """One backend call, results in the frame of the poses and in their dtype and device."""
     T_a64, T_b64 = T_a.detach().double().cpu(), T_b.detach().double().cpu()
-    R_a = T_a64[:, :3, :3]
-    R = R_a.mT @ T_b64[:, :3, :3]
+    R_a, R_b = (_orthonormal(T[:, :3, :3]) for T in (T_a64, T_b64))
+    R = R_a.mT @ R_b
     t = (R_a.mT @ (T_b64 - T_a64)[:, :3, 3:])[:, :, 0]  # relative: nothing is lost far from the origin
     if len(pairs) == 0:
         empty = t.to(T_a)
         return empty[:, 0], empty, empty, empty
-    distance, normal, point_a, point_b = run(parts.to(device="cpu", dtype=torch.float64), pairs.cpu(), R, t)
+    distance, normal, point_a, point_b = run(parts.reference, pairs.cpu(), R, t)
     normal, point_a, point_b = ((R_a @ x[:, :, None])[:, :, 0] for x in (normal, point_a, point_b))
     origin = T_a64[:, :3, 3]
     return distance.to(T_a), normal.to(T_a), (point_a + origin).to(T_a), (point_b + origin).to(T_a)
 
 
+def _smoothed(T_a, T_b, parts, pairs, normal, smoothing: Smoothing) -> tuple[Tensor, Tensor, Tensor]:
+    """Normal and smoothed witness points, found in the frame of body a: a turning camera changes no draw."""
+    T_a_b = se3.inverse(T_a) @ T_b
+    vertices_a, vertices_b = (parts.padded.to(T_a)[i] for i in pairs.unbind(1))
+    mask_a, mask_b = (parts.padded_mask[i].to(T_a.device) for i in pairs.unbind(1))
+    local = (normal[:, None] @ T_a[:, :3, :3])[:, 0]
+    n, a, b = smoothed_points(vertices_a, mask_a, se3.apply(T_a_b, vertices_b), mask_b, local, smoothing)
+    return (n[:, None] @ T_a[:, :3, :3].mT)[:, 0], *(se3.apply(T_a, x[:, None])[:, 0] for x in (a, b))
+
+
 def _pose_gradient(run, T_a, T_b, parts, pairs, smoothing: Smoothing) -> tuple[Tensor, Tensor]:
-    """E[∂d(T exp ξ)/∂T] over antithetic rotations ξ of both bodies: unbiased, one backend call a sample."""
+    """E[∂d(T exp ξ)/∂T] over antithetic rotations ξ of both bodies: unbiased, all samples in one backend call.
+
+    ``noise`` is that of the one body against the other, so each body gets its share of the variance.
+    """
     generator = torch.Generator().manual_seed(smoothing.seed)
-    half = torch.randn((smoothing.samples + 1) // 2, 2, len(pairs), 3, generator=generator, dtype=torch.float64)
-    half = half.to(T_a) * smoothing.noise
-    total_a, total_b = torch.zeros_like(T_a), torch.zeros_like(T_b)
-    for xi_a, xi_b in torch.cat([half, -half]):
-        E_a, E_b = (se3.from_rotation_translation(se3.exp_so3(xi), torch.zeros_like(xi)) for xi in (xi_a, xi_b))
-        _, n, a, b = _query(run, T_a @ E_a, T_b @ E_b, parts, pairs)
-        total_a -= _outer(n, T_a @ E_a, a) @ E_a.mT
-        total_b += _outer(n, T_b @ E_b, b) @ E_b.mT
-    return total_a / (2 * len(half)), total_b / (2 * len(half))
+    n_pairs, shape = len(pairs), ((smoothing.samples + 1) // 2, 2, len(pairs), 3)
+    half = torch.randn(shape, generator=generator, dtype=torch.float64).to(T_a) * (smoothing.noise * 0.5**0.5)
+    turn = se3.exp_so3(torch.cat([half, -half]))
+    turn = se3.from_rotation_translation(turn, turn.new_zeros(turn.shape[:-1]))
+    turned_a, turned_b = (T_a @ turn[:, 0]).flatten(0, 1), (T_b @ turn[:, 1]).flatten(0, 1)
+    _, n, a, b = _query(run, turned_a, turned_b, parts, pairs.repeat(len(turn), 1))
+    outer_a, outer_b = (_outer(n, T, x).unflatten(0, (len(turn), n_pairs)) for T, x in ((turned_a, a), (turned_b, b)))
+    return -(outer_a @ turn[:, 0].mT).mean(0), (outer_b @ turn[:, 1].mT).mean(0)
 
 
 def _outer(normal: Tensor, T: Tensor, point: Tensor) -> Tensor:
@@ -194,6 +210,17 @@ def _outer(normal: Tensor, T: Tensor, point: Tensor) -> Tensor:
     local = ((point - T[:, :3, 3])[:, None] @ T[:, :3, :3])[:, 0]
     top = normal[:, :, None] * torch.cat([local, torch.ones_like(local[:, :1])], dim=-1)[:, None]
     return torch.cat([top, torch.zeros_like(top[:, :1])], dim=1)
+
+
+def _orthonormal(R: Tensor) -> Tensor:
+    """Rotations (E, 3, 3) nearest to almost-rotations, float32 ones say: distances are as exact as rotations are."""
+    eye = torch.eye(3, dtype=R.dtype, device=R.device)
+    for _ in range(4):
+        excess = R.mT @ R - eye
+        if not bool((excess.abs() > 1e-15).any()):
+            break
+        R = R - 0.5 * R @ excess
+    return R
 
 
 def _moved(T: Tensor, shift: Tensor) -> Tensor:

@@ -45,20 +45,21 @@ def meeting_pairs(
     bounds: Bounds, entity: Tensor, start: Tensor, entity_pairs: Tensor, *, margin: float = 0.0
 ) -> Tensor:
     """Pairs (E, 2) of part instances whose boxes come within ``margin`` [m] of each other, among the entity pairs."""
-    return _two_level(bounds, entity, start, entity_pairs, lambda a, b: _overlap(a, b, 3, margin))
+    return _two_level(bounds, entity, start, entity_pairs, lambda a, b, _: _overlap(a, b, 3, margin))
 
 
 def pairs_below(
-    bounds: Bounds, entity: Tensor, start: Tensor, entity_pairs: Tensor, *, reach: float
+    bounds: Bounds, entity: Tensor, start: Tensor, entity_pairs: Tensor, *, reach: Tensor | float
 ) -> Tensor:
     """Pairs (E, 2) of part instances (a, b) such that a, falling by at most ``reach`` [m], may meet b.
 
-    ``entity_pairs`` are ordered: (who falls, onto whom).
+    ``entity_pairs`` are ordered: (who falls, onto whom); ``reach`` is one length, or one for each entity.
     """
+    reach = torch.as_tensor(reach, dtype=bounds.lower.dtype, device=bounds.lower.device).expand(len(start) - 1)
 
-    def may_land(a: Bounds, b: Bounds) -> Tensor:
+    def may_land(a: Bounds, b: Bounds, who: Tensor) -> Tensor:
         # z points down: b must reach deeper than a's top does, and not lie farther below a's bottom than the fall
-        vertical = (b.upper[:, 2] > a.lower[:, 2]) & (b.lower[:, 2] < a.upper[:, 2] + reach)
+        vertical = (b.upper[:, 2] > a.lower[:, 2]) & (b.lower[:, 2] < a.upper[:, 2] + reach[who])
         return _overlap(a, b, 2, 0.0) & vertical
 
     return _two_level(bounds, entity, start, entity_pairs, may_land)
@@ -73,9 +74,11 @@ def _overlap(a: Bounds, b: Bounds, axes: int, margin: float) -> Tensor:
 def _two_level(bounds: Bounds, entity: Tensor, start: Tensor, entity_pairs: Tensor, test) -> Tensor:
     """Test whole entities, then the parts of those that pass."""
     whole = entity_bounds(bounds, entity, len(start) - 1)
-    near = test(Bounds(*(x[entity_pairs[:, 0]] for x in whole)), Bounds(*(x[entity_pairs[:, 1]] for x in whole)))
+    first, second = entity_pairs.unbind(1)
+    near = test(Bounds(*(x[first] for x in whole)), Bounds(*(x[second] for x in whole)), first)
     pairs = part_pairs(start, entity_pairs[near])
-    near = test(Bounds(*(x[pairs[:, 0]] for x in bounds)), Bounds(*(x[pairs[:, 1]] for x in bounds)))
+    first, second = pairs.unbind(1)
+    near = test(Bounds(*(x[first] for x in bounds)), Bounds(*(x[second] for x in bounds)), entity[first])
     return pairs[near]
 
 

@@ -26,7 +26,8 @@ def plane_distance(
         smoothing: smoothing of the gradient; None for the exact one. ``pose`` means ``ring`` here.
 
     Returns:
-        distance (P,), differentiable with respect to poses and plane; normal from part to half-space (down); witness points.
+        distance (P,), differentiable with respect to poses and plane; normal from part to half-space (down); witness
+        points.
     """
     if T.shape != (parts.n_parts, 4, 4):
         raise InvalidInputError(f"T has shape {tuple(T.shape)}, expected ({parts.n_parts}, 4, 4): a pose for each part")
@@ -43,6 +44,11 @@ def half_space_distance(
     Args:
         T: (E, 4, 4) poses; index: (E,) which part; normal: (E, 3) pointing out of the half-space; offset: (E,) [m].
     """
+    with torch.autocast(T.device.type, enabled=False):  # a micrometre is lost in half precision
+        return _half_space_distance(T, parts, index, normal, offset, smoothing)
+
+
+def _half_space_distance(T, parts, index, normal, offset, smoothing) -> DistanceResult:
     local = parts.padded.to(T)[index]
     down = -(normal[:, None] @ T[:, :3, :3])[:, 0]
     with torch.no_grad():

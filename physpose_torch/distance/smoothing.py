@@ -1,8 +1,19 @@
 """Randomized smoothing of the distance gradient: where, on average, two parts touch when the contact direction wobbles.
 
 The translation part of the distance gradient is always informative; the torque jumps when the witness point moves from
-vertex to vertex, and a face that rests on a face gets none that is usable. So the witness point is smoothed, never the value
-(paper Sec. 2; Montaut et al. 2023, "Differentiable collision detection: a randomized smoothing approach").
+vertex to vertex, and a face that rests on a face gets none that is usable. So the witness point is smoothed, never the
+value (paper Sec. 2; Montaut et al. 2023, "Differentiable collision detection: a randomized smoothing approach").
+
+The truth that the fast kinds approximate is E[∇d] over random rotations of the two bodies against each other, by
+``noise`` [rad] per axis, about their contact; the kind ``pose`` turns them about the origins of their frames, which
+also slides the contact (levers differ by up to 0.03 of the body's radius, of two balls by 0.05).
+
+Measured at a noise of 0.1, error of the lever over the body's radius, ``ring`` and ``gaussian`` with many draws:
+edge-edge, vertex-face, ball on slab 0.01; face, rim, edge or ball that rests on something of its size or on its
+middle 0.035; lying can 0.055; cube off the middle of a slab five times its size 0.08; half over that slab's border
+0.14; corner on corner, whose normal turns too, 0.2; over random contacts 0.05 on average, 0.27 at worst. The hard
+gradient is off by 0.5 on faces. ``gumbel`` blurs a length, not an angle: on upright contacts it is as near, on cubes
+tilted by 2° to 6° it is off by 0.3 at a temperature of 1 mm.
 """
 
 import functools
@@ -16,8 +27,9 @@ from physpose_torch.config import Smoothing
 __all__ = ["smoothed_points", "vertex_weights"]
 
 NEWTON_STEPS = 30
-RING_RADII = 4
-CONTACT_BLUR = 1e-6
+RING_RADII = 6
+GOLDEN = 0.6180339887498949
+CONTACT_BLUR = 1e-5
 """[m]; spread that every contact point has at least, so that two vertices meet half-way."""
 
 
@@ -25,12 +37,12 @@ def vertex_weights(vertices: Tensor, mask: Tensor, normal: Tensor, smoothing: Sm
     """How often each vertex is the farthest along a wobbling direction.
 
     Args:
-        vertices: (E, K, 3) padded vertices [m].
+        vertices: (E, K, 3) vertices, padded by the first one [m].
         mask: (E, K) bool, False on padding.
         normal: (E, 3) unit directions.
         smoothing: ``gumbel``: softmax(s·n / temperature), closed form. ``gaussian``: share of the draws of
-            argmax s·(n + noise z), z ~ N(0, I) (DiffCol, first order). ``ring``: the same expectation by fixed
-            quadrature on rings around n, free of sampling noise.
+            argmax s·(n + noise z), z ~ N(0, I) (DiffCol, first order), in antithetic pairs. ``ring``: the same
+            expectation by fixed quadrature on rings around n, free of sampling noise.
 
     Returns:
         (E, K) weights that sum to one.
@@ -40,13 +52,15 @@ def vertex_weights(vertices: Tensor, mask: Tensor, normal: Tensor, smoothing: Sm
         return torch.softmax((height / smoothing.temperature).masked_fill(~mask, -torch.inf), dim=1)
     if smoothing.kind == "gaussian":
         generator = torch.Generator().manual_seed(smoothing.seed)
-        draws = torch.randn(smoothing.samples, 3, generator=generator, dtype=torch.float64).to(normal)
+        half = torch.randn((smoothing.samples + 1) // 2, 3, generator=generator, dtype=torch.float64).to(normal)
+        draws = torch.cat([half, -half])
         directions = normal[:, None] + smoothing.noise * draws
-        share = normal.new_full((smoothing.samples,), 1.0 / smoothing.samples)
+        share = normal.new_full((len(draws),), 1.0 / len(draws))
     else:
         ring, share = (x.to(normal) for x in _rings(smoothing.samples))
         directions = normal[:, None] + smoothing.noise * (ring @ tangent_basis(normal))
-    farthest = (directions @ vertices.mT).masked_fill(~mask[:, None], -torch.inf).argmax(2)
+    farthest = (directions @ vertices.mT).argmax(2)
+    farthest = torch.where(mask.gather(1, farthest), farthest, 0)  # padding repeats the first vertex
     return torch.zeros_like(mask, dtype=normal.dtype).scatter_add(1, farthest, share.expand(len(normal), -1))
 
 
@@ -98,7 +112,8 @@ def smoothed_points(
 def tangent_basis(normal: Tensor) -> Tensor:
     """(E, 2, 3) orthonormal vectors across unit normals (E, 3) (Duff et al. 2017)."""
     x, y, z = normal.unbind(-1)
-    sign = torch.where(z < 0, -torch.ones_like(z), torch.ones_like(z))
+    # the basis jumps somewhere: not at z = 0, where the faces of upright boxes are and rounding would decide
+    sign = torch.where(z < -0.3, -torch.ones_like(z), torch.ones_like(z))
     a = -1.0 / (sign + z)
     b = x * y * a
     u = torch.stack([1.0 + sign * x * x * a, sign * b, -sign * x], dim=-1)
@@ -108,12 +123,15 @@ def tangent_basis(normal: Tensor) -> Tensor:
 
 @functools.cache
 def _rings(samples: int) -> tuple[Tensor, Tensor]:
-    """Nodes (M, 2) and weights (M,) of a standard normal in the plane: trapezoid rule round the angle, and Gauss-Laguerre
-    for ½|z|², which is exponentially distributed."""
+    """Nodes (M, 2) and weights (M,) of a standard normal in the plane.
+
+    Trapezoid rule round the angle, and Gauss-Laguerre for ½|z|², which is exponentially distributed. The rings are
+    turned against each other, so that the straight borders between vertices do not meet the nodes of all rings at once.
+    """
     half_square, weight = np.polynomial.laguerre.laggauss(RING_RADII)
-    angle = 2 * np.pi * (np.arange(samples) + 0.5) / samples
-    radius = np.sqrt(2 * half_square)
-    nodes = np.stack([np.outer(radius, f(angle)).ravel() for f in (np.cos, np.sin)], axis=1)
+    angle = 2 * np.pi * (np.arange(samples) + 0.5 + GOLDEN * np.arange(RING_RADII)[:, None]) / samples
+    radius = np.sqrt(2 * half_square)[:, None]
+    nodes = np.stack([(radius * f(angle)).ravel() for f in (np.cos, np.sin)], axis=1)
     return torch.from_numpy(nodes), torch.from_numpy(np.repeat(weight / samples, samples))
 
 

@@ -1,6 +1,5 @@
 """What a scene is made of: rigid bodies with convex parts, and planes."""
 
-import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -57,8 +56,8 @@ class Body:
             **coacd_options: fields of :class:`~physpose_torch.geometry.decompose.DecomposeOptions`.
 
         Raises:
-            DataError: the file is missing or cannot be read.
-            InvalidInputError: the mesh is empty, not finite, or without volume; an option is unknown.
+            DataError: the file is missing or cannot be read, or the mesh has no faces, NaN, or no volume.
+            InvalidInputError: it is larger than 10 m or smaller than 1 mm, as in other units; an option is unknown.
         """
         mesh = load_mesh(mesh, label=label, scale=scale)
         try:
@@ -66,7 +65,7 @@ class Body:
         except TypeError as error:
             known = ", ".join(DecomposeOptions.__dataclass_fields__)
             raise InvalidInputError(f"{label}: {error}; decomposition options are {known}") from error
-        hulls, report = decompose(mesh, options, cache=cache)
+        hulls, report = decompose(mesh, options, cache=cache, name=label)
         return cls(label, ConvexParts.from_hulls(hulls), mesh, _checked_symmetries(symmetries, label), report)
 
     @classmethod
@@ -137,6 +136,8 @@ class Plane:
         length = float(torch.linalg.vector_norm(self.normal.detach()))
         if abs(length - 1.0) > 1e-3:
             raise InvalidInputError(f"Plane normal has length {length:.4g}, expected a unit vector pointing up")
+        if self.covariance is not None and not _is_covariance(self.covariance.detach().double()):
+            raise InvalidInputError(f"Plane covariance = {self.covariance.tolist()} is not positive semi-definite")
         object.__setattr__(self, "normal", self.normal / torch.linalg.vector_norm(self.normal))
 
     @classmethod
@@ -167,7 +168,9 @@ def load_mesh(mesh: trimesh.Trimesh | str | Path, *, label: str, scale: float = 
     if isinstance(mesh, trimesh.Scene):
         mesh = mesh.to_mesh()
     if not isinstance(mesh, trimesh.Trimesh):
-        raise InvalidInputError(f"{label}: got a {type(mesh).__name__}, expected a trimesh.Trimesh or the path of a mesh")
+        raise InvalidInputError(
+            f"{label}: got a {type(mesh).__name__}, expected a trimesh.Trimesh or the path of a mesh"
+        )
     if len(mesh.faces) == 0:
         raise DataError(f"{label}: the mesh has no faces; convex parts need a surface")
     # only geometry is kept: texture seams would split vertices, and visuals are not ours to copy
@@ -175,12 +178,12 @@ def load_mesh(mesh: trimesh.Trimesh | str | Path, *, label: str, scale: float = 
     if not np.isfinite(out.vertices).all():
         raise DataError(f"{label}: the mesh has NaN or infinite vertices")
     out.merge_vertices(merge_tex=True, merge_norm=True)
-    extent = float(out.extents.max())
-    if extent > 10.0:
-        warnings.warn(
-            f"{label} is {extent:.3g} m large; are its vertices in millimetres? Then pass scale=0.001", stacklevel=3
-        )
     return out
+
+
+def _is_covariance(matrix: Tensor) -> bool:
+    variance = torch.linalg.eigvalsh(matrix)
+    return bool(variance.min() >= -1e-6 * variance.abs().max())
 
 
 def _checked_symmetries(symmetries: Tensor | None, label: str) -> Tensor | None:

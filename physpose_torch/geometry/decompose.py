@@ -33,10 +33,8 @@ __all__ = ["DecomposeOptions", "DecomposeReport", "Decomposition", "decompose", 
 
 logger = logging.getLogger("physpose_torch")
 
-ALGORITHM_VERSION = 1  # part of the cache key: raise it whenever results change
-SHAVE = 1.0
-CAP_RATIO = 1.0
-CUT_RATIO = 3.0  # CoACD cuts to this many tolerances of concavity, merging undoes the needless cuts
+ALGORITHM_VERSION = 2  # part of the cache key: raise it whenever results change
+SHAVE = 1.0  # a facet over a hollow may be moved inwards by this many tolerances
 MIN_THICKNESS = 2e-4  # [m] a part flatter than this is extruded to it, so that every hull has a volume
 
 
@@ -216,15 +214,21 @@ def _anchor(parts: list[np.ndarray], surface: _Surface, tolerance: float) -> lis
     return [np.concatenate([p, surface.extreme[lost & (nearest == k)]]) for k, p in enumerate(parts)]
 
 
+def _missed(few: np.ndarray, points: np.ndarray) -> float:
+    """How far points lie outside the hull of few [m]."""
+    equations = _hull(few)[2]
+    return float((points @ equations[:, :3].T + equations[:, 3]).max())
+
+
 def _merge(
     parts: list[np.ndarray], surface: _Surface, options: DecomposeOptions, tolerance: float, share: float = 0.03
-):
+) -> list[np.ndarray]:
     """Merge neighbours, least harm first, while at most `share` of the surface stands out by more than tolerance.
 
-    No merger is made whose hull cannot be told within tolerance by max_vertices vertices.
+    No union is made that max_vertices vertices cannot tell within options.tolerance, unless there are too many parts.
     """
-    parts = dict(enumerate(_hull(p)[0] for p in parts))
-    cost = {i: _excess(p, surface, tolerance) for i, p in parts.items()}
+    parts = dict(enumerate(_hull(part)[0] for part in parts))
+    cost = {i: _excess(part, surface, tolerance) for i, part in parts.items()}
     budget = share * surface.area.sum() - sum(bad for bad, _ in cost.values())
     fresh, queue = itertools.count(len(parts)), []
 
@@ -241,13 +245,10 @@ def _merge(
         propose(i, [j for j in parts if j < i])
     while queue:
         _, bad, i, j, union, both = heapq.heappop(queue)
-        if i not in parts or j not in parts or (bad > max(budget, 0) and len(parts) <= options.max_hulls):
+        if i not in parts or j not in parts:
             continue
-        few = _inscribed(union, options.max_vertices)
-        if (
-            (few is not union)
-            and _missed(few, union) > CAP_RATIO * options.tolerance
-            and len(parts) <= options.max_hulls
+        if len(parts) <= options.max_hulls and (
+            bad > max(budget, 0) or _missed(_inscribed(union, options.max_vertices), union) > options.tolerance
         ):
             continue
         k = next(fresh)
@@ -257,67 +258,66 @@ def _merge(
     return list(parts.values())
 
 
-def _missed(few: np.ndarray, points: np.ndarray) -> float:
-    equations = _hull(few)[2]
-    return float((points @ equations[:, :3].T + equations[:, 3]).max())
-
-
-def _balanced(vertices: np.ndarray, points: np.ndarray, limit: float) -> np.ndarray:
-    """Move inscribed vertices so that their support function fits that of points in the least-squares sense."""
-    directions = np.concatenate([_sphere(2000), np.eye(3), -np.eye(3)])
-    weight = np.concatenate([np.ones(2000), np.full(6, 20.0)])
-    target, moved = (directions @ points.T).max(1), vertices.copy()
-    for _ in range(5):
-        height = directions @ moved.T
-        owner, miss = height.argmax(1), target - height.max(1)
-        for k in range(len(moved)):
-            u, w = directions[owner == k], weight[owner == k]
-            if len(u):
-                moved[k] += np.linalg.solve((u.T * w) @ u + 0.3 * w.sum() * np.eye(3) / 3, u.T @ (w * miss[owner == k]))
-        step = moved - vertices
-        length = np.linalg.norm(step, axis=1, keepdims=True)
-        moved = vertices + step * np.minimum(1, limit / np.maximum(length, 1e-12))
-    return _hull(moved)[0]
-
-
-def _sphere(n: int) -> np.ndarray:
-    """n unit vectors on a Fibonacci spiral."""
-    k = np.arange(n) + 0.5
-    z, turn = 1 - 2 * k / n, k * np.pi * (1 + 5**0.5)
-    return np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], 1)
-
-
 def _few(points: np.ndarray, options: DecomposeOptions) -> np.ndarray:
-    few = _inscribed(points, options.max_vertices)
-    return _balanced(few, points, options.tolerance) if _missed(few, points) > options.tolerance / 2 else few
+    """At most max_vertices vertices; where an inscribed hull misses much, the error is balanced inside and outside.
+
+    The vertices are moved, by at most the tolerance, so that their support function fits that of points in the
+    least-squares sense: each gets the directions in which it is the support. The six axes, where objects stand, weigh
+    more.
+    """
+    vertices = _inscribed(points, options.max_vertices)
+    if _missed(vertices, points) <= options.tolerance / 2:
+        return vertices
+    k = np.arange(2000) + 0.5  # Fibonacci spiral
+    height, turn = 1 - k / 1000, k * np.pi * (1 + 5**0.5)
+    ring = np.sqrt(1 - height**2)
+    directions = np.stack([ring * np.cos(turn), ring * np.sin(turn), height], 1)
+    directions = np.concatenate([directions, np.eye(3), -np.eye(3)])
+    weight = np.concatenate([np.ones(2000), np.full(6, 20.0)])
+    target, moved = (directions @ points.T).max(1), vertices
+    for _ in range(5):
+        heights = directions @ moved.T
+        owner, miss = heights.argmax(1), target - heights.max(1)
+        step = moved - vertices
+        for v in np.unique(owner):
+            u, w = directions[owner == v], weight[owner == v]
+            step[v] += np.linalg.solve((u.T * w) @ u + 0.1 * w.sum() * np.eye(3), u.T @ (w * miss[owner == v]))
+        length = np.linalg.norm(step, axis=1, keepdims=True)
+        moved = vertices + step * np.minimum(1, options.tolerance / np.maximum(length, 1e-12))
+    return _hull(moved)[0]
 
 
 _CHILD = """
 import signal, sys
 import coacd, numpy
 if hasattr(signal, "alarm"):
-    signal.alarm(int(sys.argv[2]))  # ends by itself should the parent be killed
+    signal.alarm(int(sys.argv[2]))  # it ends by itself should the parent be killed
 coacd.set_log_level("error")
 with numpy.load(sys.argv[1] + "/in.npz") as data:
     parts = coacd.run_coacd(
         coacd.Mesh(data["vertices"], data["faces"]), threshold=float(data["threshold"]), seed=int(data["seed"]),
-        preprocess_mode=str(data["preprocess_mode"]), real_metric=True, merge=False, mcts_nodes=10, mcts_iterations=60)
+        preprocess_mode=str(data["preprocess_mode"]), preprocess_resolution=30, real_metric=True, merge=False,
+        mcts_nodes=10, mcts_iterations=60)
 parts = [vertices for vertices, _ in parts]
 numpy.savez(sys.argv[1] + "/out.npz", vertices=numpy.concatenate(parts), counts=[len(p) for p in parts])
 """
 _child_command = [sys.executable, "-P", "-c", _CHILD]  # a program text, not an import: works from scripts and notebooks
 
 
-def _run_coacd(vertices: np.ndarray, faces: np.ndarray, *, deadline: float, stop: threading.Event, **settings):
-    """CoACD's parts as vertex arrays [m]; BackendError if the child crashes or is still running at the deadline."""
-    limit = deadline - time.monotonic()
+def _run_coacd(
+    vertices: np.ndarray, faces: np.ndarray, *, deadline: float, stop: threading.Event, **settings
+) -> list[np.ndarray]:
+    """CoACD's parts as vertex arrays [m]; BackendError if the child crashes, is stopped, or runs past the deadline."""
+    limit = max(deadline - time.monotonic(), 0)
     with tempfile.TemporaryDirectory(prefix="physpose_", ignore_cleanup_errors=True) as folder:
         np.savez(f"{folder}/in.npz", vertices=vertices, faces=faces, **settings)
         child = subprocess.Popen(
-            [*_child_command, folder, str(int(limit) + 2)],
-            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
-        )  # fmt: skip
+            [*_child_command, folder, str(int(limit) + 5)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+        )
         try:
             while True:
                 try:
@@ -326,12 +326,12 @@ def _run_coacd(vertices: np.ndarray, faces: np.ndarray, *, deadline: float, stop
                 except subprocess.TimeoutExpired:
                     if stop.is_set() or time.monotonic() > deadline:
                         raise BackendError(f"CoACD was stopped after {limit:.0f} s") from None
-        finally:
+        finally:  # also on KeyboardInterrupt
             child.kill()
             child.wait()
         if child.returncode != 0:
             tail = message.decode(errors="replace").strip().splitlines()[-1:]
-            raise BackendError(f"CoACD's process ended with code {child.returncode}: {' '.join(tail)}")
+            raise BackendError(f"CoACD's process ended with code {child.returncode} {' '.join(tail)}")
         with np.load(f"{folder}/out.npz") as data:
             return np.split(data["vertices"], np.cumsum(data["counts"])[:-1])
 
@@ -341,22 +341,21 @@ def _canonical(mesh: trimesh.Trimesh, name: str) -> trimesh.Trimesh:
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces)
     if len(vertices) == 0 or len(faces) == 0:
         raise DataError(f"{name} has {len(vertices)} vertices and {len(faces)} faces; expected a triangle mesh")
-    corners = vertices[faces]
+    corners = vertices[faces].reshape(-1, 3)
     if not np.isfinite(corners).all():
         raise DataError(f"{name} has NaN or infinite vertices; repair the mesh")
-    size = np.ptp(corners.reshape(-1, 3), axis=0).max()
+    size = np.ptp(corners, axis=0).max()
     if not 1e-3 <= size <= 10:
         raise InvalidInputError(
             f"{name} is {size:.4g} m large, expected 0.001 to 10: vertices are in metres; pass scale=0.001 "
             "(or mesh.apply_scale(0.001)) for a mesh in millimetres"
         )
-    grid, index = np.unique(np.round(corners.reshape(-1, 3) * 1e9).astype(np.int64), axis=0, return_inverse=True)
+    grid, index = np.unique(np.round(corners * 1e9).astype(np.int64), axis=0, return_inverse=True)
     faces = index.reshape(-1, 3)
     faces = np.take_along_axis(faces, (faces.argmin(1)[:, None] + np.arange(3)) % 3, axis=1)
     faces = faces[np.lexsort(faces.T[::-1])]
-    distinct = np.sort(faces, axis=1)
-    _, first = np.unique(distinct, axis=0, return_index=True)
-    faces = faces[np.sort(first[(np.diff(distinct[first]) > 0).all(1)])]
+    distinct, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    faces = faces[np.sort(first[(np.diff(distinct) > 0).all(1)])]
     clean = trimesh.Trimesh(grid * 1e-9, faces, process=False)
     clean.remove_unreferenced_vertices()
     if len(faces) == 0 or np.linalg.eigvalsh(np.cov(clean.vertices.T))[0] < (1e-3 * MIN_THICKNESS) ** 2:
@@ -371,16 +370,14 @@ def _inside(points: np.ndarray, equations: np.ndarray) -> np.ndarray:
 
 
 def _measure(parts: list[np.ndarray], surface: _Surface, tolerance: float, n: int = 20_000) -> dict[str, float]:
-    """Outward and inward error of the final hulls at n sample points each."""
+    """Outward and inward error [m] of the final hulls at n sample points each."""
     hulls = [_hull(part) for part in parts]
-    triangles, owner = (
-        np.concatenate([h[1] for h in hulls]),
-        np.repeat(np.arange(len(hulls)), [len(h[1]) for h in hulls]),
-    )
+    triangles = np.concatenate([h[1] for h in hulls])
+    owner = np.repeat(np.arange(len(hulls)), [len(h[1]) for h in hulls])
     union = _Surface(triangles, solid=False, n_samples=n)
     points, triangle = _sample(triangles, union.area, n)
-    exposed = ~np.any([_inside(points, h[2]) & (owner[triangle] != k) for k, h in enumerate(hulls)], axis=0)
-    outward = surface.signed_distance(points[exposed])
+    covered = np.any([_inside(points, h[2]) & (owner[triangle] != k) for k, h in enumerate(hulls)], axis=0)
+    outward = surface.signed_distance(points[~covered])
     outward = np.maximum(outward[outward > -tolerance], 0)  # what is deeper is a cut through the body, not its surface
     points, _ = _sample(surface.triangles, surface.area, n)
     missed = ~np.any([_inside(points, h[2]) for h in hulls], axis=0)
@@ -396,14 +393,14 @@ def _measure(parts: list[np.ndarray], surface: _Surface, tolerance: float, n: in
 
 
 def _cut(
-    mesh: trimesh.Trimesh, surface: _Surface, options: DecomposeOptions, stop: threading.Event
+    mesh: trimesh.Trimesh, surface: _Surface, options: DecomposeOptions, threshold: float, stop: threading.Event
 ) -> list[np.ndarray]:
     """CoACD's parts, their vertices put back onto the mesh (simplification and remeshing move them)."""
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if len(faces) > options.max_faces:
         vertices, faces = fast_simplification.simplify(vertices, faces, target_count=options.max_faces)
     deadline = time.monotonic() + options.time_limit_s
-    settings = {"threshold": CUT_RATIO * options.tolerance, "seed": options.seed}
+    settings = {"threshold": threshold, "seed": options.seed}
     # "off" neither inflates nor remeshes but needs a closed mesh; "auto" remeshes an open one
     modes = ["off", "auto"] if mesh.is_watertight else ["auto"]
     for mode in modes:
@@ -414,6 +411,31 @@ def _cut(
             if mode == modes[-1] or time.monotonic() > deadline:
                 raise
     raise AssertionError("unreachable")
+
+
+def _cut_and_merge(mesh: trimesh.Trimesh, surface: _Surface, options: DecomposeOptions, stop: threading.Event):
+    """Cut finer and merge more strictly until the final hulls are within tolerance, else return the best parts.
+
+    One coarse cut first: most models need no other, and time and parts grow with the square of fineness.
+    """
+    best, cuts = None, {}
+    for fineness, strictness in ((3.0, 1.0), (3.0, 0.7), (2.0, 0.7)):
+        tolerance = strictness * options.tolerance  # merging judges by fewer samples than the final measure
+        try:
+            if fineness not in cuts:
+                cuts[fineness] = _cut(mesh, surface, options, fineness * options.tolerance, stop)
+        except BackendError:
+            if best is None:
+                raise
+            break
+        merged = _merge(cuts[fineness], surface, options, tolerance)
+        parts = [_few(_shave(part, surface, tolerance), options) for part in merged]
+        errors = _measure(parts, surface, options.tolerance)
+        if best is None or errors["outward_p95"] < best[1]["outward_p95"]:
+            best = parts, errors
+        if errors["outward_p95"] <= options.tolerance or len(parts) >= options.max_hulls:
+            break
+    return best
 
 
 def _decompose(mesh, options: DecomposeOptions, cache: bool, name: str, stop: threading.Event) -> Decomposition:
@@ -427,14 +449,9 @@ def _decompose(mesh, options: DecomposeOptions, cache: bool, name: str, stop: th
     method, parts, errors = "convex", whole, _measure(whole, surface, options.tolerance)
     if max(errors["outward_p95"], errors["inward_p95"]) > options.tolerance:
         try:
-            cut = _cut(mesh, surface, options, stop)
-            for strictness in (1.0, 0.7):  # merging judges by fewer samples than the final measure
-                tolerance = strictness * options.tolerance
-                merged = _merge(cut, surface, options, tolerance)
-                method, parts = "coacd", [_few(_shave(p, surface, tolerance), options) for p in merged]
-                errors = _measure(parts, surface, options.tolerance)
-                if errors["outward_p95"] <= options.tolerance:
-                    break
+            cut_parts, cut_errors = _cut_and_merge(mesh, surface, options, stop)
+            if cut_errors["outward_p95"] < errors["outward_p95"]:  # else cutting was of no use
+                method, parts, errors = "coacd", cut_parts, cut_errors
         except BackendError as error:
             method, warning = "hull", f"{name}: {error}; its convex hull is used instead"
             warnings.warn(warning, stacklevel=3)

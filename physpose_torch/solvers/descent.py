@@ -9,7 +9,8 @@ from torch import Tensor
 
 from physpose_torch import se3
 from physpose_torch.config import RefinerConfig
-from physpose_torch.losses import PhysicsTerms, physics_terms, pose_loss
+from physpose_torch.losses import PhysicsTerms, physics_terms, prior_loss
+from physpose_torch.prior import PosePrior
 from physpose_torch.scene import Scene
 
 __all__ = ["Descent", "descend"]
@@ -34,9 +35,8 @@ class Descent(NamedTuple):
 
 
 def descend(
-    measured: Tensor,
+    prior: PosePrior,
     scene: Scene,
-    covariance: Tensor,
     acts: Tensor,
     config: RefinerConfig,
     callback: Callable[[int, Tensor, PhysicsTerms], None] | None = None,
@@ -48,18 +48,16 @@ def descend(
     sure; for plain gradient descent L is the identity, as in the paper.
 
     Args:
-        measured: estimates T̃_camera_object, (N, 4, 4) float64 [m].
+        prior: the flat estimates and their uncertainty, float64; the descent starts there.
         scene: the flat scene.
-        covariance: (N, 6, 6) of the estimates.
         acts: (N,) bool, see :func:`physpose_torch.losses.acting`.
         config: optimizer options.
         callback: called with step, poses (N, 4, 4) and terms of the images still running before each step.
     """
     n, n_images = len(scene), scene.n_images
-    poses = measured.clone()
-    precision = torch.cholesky_inverse(torch.linalg.cholesky(covariance))
+    poses = prior.measured.clone()
     radius = scene.object_radius.to(poses)
-    scale = _principal_scale(covariance) if config.optimizer == "adam" else torch.eye(6).to(poses).expand(n, 6, 6)
+    scale = _principal_scale(prior) if config.optimizer == "adam" else torch.eye(6).to(poses).expand(n, 6, 6)
     x = torch.zeros(n, 6, dtype=poses.dtype, device=poses.device, requires_grad=True)
     if config.optimizer == "adam":
         optimizer = torch.optim.Adam([x], lr=config.learning_rate, betas=ADAM_BETAS, eps=ADAM_EPS)
@@ -67,25 +65,29 @@ def descend(
         optimizer = torch.optim.SGD([x], lr=config.learning_rate)
     schedule = None
     if config.decay == "cosine" and config.steps:
-        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda k: 0.5 * (1 + math.cos(math.pi * k / config.steps)))
+        schedule = torch.optim.lr_scheduler.LambdaLR(
+            optimizer, lambda k: 0.5 * (1 + math.cos(math.pi * k / config.steps))
+        )
 
     still = torch.zeros(n_images, dtype=torch.long)
     steps = torch.full((n_images,), config.steps)
     done = torch.bincount(scene.image, minlength=n_images) == 0  # nothing in an empty image: nothing to do
     steps[done] = 0
-    active, rows = scene.select((~done).nonzero()[:, 0])
+    active, rows, active_prior = _select(scene, prior, ~done)
     trajectory = [poses.clone()] if config.keep_trajectory else None
     for step in range(config.steps):
         if bool(done.all()):
             break
         leaf = poses[rows].requires_grad_()
-        pose = pose_loss(leaf, measured[rows], precision[rows])
+        pose = prior_loss(leaf, active_prior)
         collision, share, gravity = physics_terms(leaf, active, acts[rows], config.physics)
         weights = config.physics
         total = weights.pose_weight * pose + weights.collision_weight * share + weights.gravity_weight * gravity
         (gradient,) = torch.autograd.grad(total.sum(), leaf)
         if callback is not None:
-            callback(step, leaf.detach(), PhysicsTerms(pose.detach(), collision.detach(), gravity.detach(), total.detach()))
+            callback(
+                step, leaf.detach(), PhysicsTerms(pose.detach(), collision.detach(), gravity.detach(), total.detach())
+            )
 
         tangent = se3.tangent_gradient(leaf.detach(), gradient)
         tangent = (scale[rows].mT @ tangent[:, :, None])[:, :, 0]
@@ -111,12 +113,22 @@ def descend(
         steps[finished] = step + 1
         if bool(finished.any()):
             done = done | finished
-            active, rows = scene.select((~done).nonzero()[:, 0])
+            active, rows, active_prior = _select(scene, prior, ~done)
     return Descent(poses, steps, done, torch.stack(trajectory) if trajectory is not None else None)
 
 
-def _principal_scale(covariance: Tensor) -> Tensor:
+def _select(scene: Scene, prior: PosePrior, running: Tensor) -> tuple[Scene, Tensor, PosePrior]:
+    """Scene, rows and prior of the images that are still running."""
+    active, rows = scene.select(running.nonzero()[:, 0])
+    image = active.image.to(prior.image.device)
+    selected = (x[rows.to(x.device)] for x in prior[:4])
+    return active, rows, PosePrior(*selected, image, active.n_images, *prior[6:])
+
+
+def _principal_scale(prior: PosePrior) -> Tensor:
     """L (N, 6, 6) with L Lᵀ = the translation and rotation blocks of the covariance, along their principal axes."""
+    covariance = torch.linalg.inv(prior.precision)
+    covariance[:, :3, :3] += prior.sigma_common**2 * prior.ray[:, :, None] * prior.ray[:, None, :]
     scale = torch.zeros_like(covariance)
     for block in (slice(0, 3), slice(3, 6)):
         variance, axes = torch.linalg.eigh(covariance[:, block, block])

@@ -1,8 +1,6 @@
 """A small BOP folder, a writer of result files, and the real data if it is there."""
 
 import json
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -42,10 +40,3 @@ def write_csv(tmp_path):
 
     return write
 
-
-@pytest.fixture(scope="session")
-def ycbv():
-    root = os.environ.get("PHYSPOSE_DATA")
-    if not root or not (Path(root) / "ycbv").is_dir():
-        pytest.skip("PHYSPOSE_DATA does not point to a folder with ycbv/")
-    return Path(root) / "ycbv"

@@ -34,7 +34,11 @@ def l_shape():
     flat = [[0, 1, 2], [0, 2, 3], [0, 3, 5], [3, 4, 5]]
     vertices = np.concatenate([np.c_[outline, np.zeros(6)], np.c_[outline, np.full(6, 0.03)]])
     sides = [[[i, (i + 1) % 6, (i + 1) % 6 + 6], [i, (i + 1) % 6 + 6, i + 6]] for i in range(6)]
-    faces = [[a, c, b] for a, b, c in flat] + [[a + 6, b + 6, c + 6] for a, b, c in flat] + sum(sides, [])
+    faces = (
+        [[a, c, b] for a, b, c in flat]
+        + [[a + 6, b + 6, c + 6] for a, b, c in flat]
+        + [face for side in sides for face in side]
+    )
     return trimesh.Trimesh(vertices, faces)
 
 
@@ -59,7 +63,7 @@ def test_box_is_one_part_with_its_eight_corners():
     hulls, report = decompose(mesh)
     assert (report.method, report.n_parts, len(hulls)) == ("convex", 1, 1)
     assert sorted(map(tuple, hulls[0].round(9))) == sorted(map(tuple, mesh.vertices.round(9)))
-    assert max(report.outward_max, report.inward_max) < 1e-8
+    assert max(report.outward_p95, report.inward_max) < 1e-8
 
 
 def test_cylinder_is_one_part_and_keeps_its_support():
@@ -94,10 +98,10 @@ def test_torus_keeps_its_hole():
 
 
 def test_open_bowl_keeps_its_hollow():
-    bowl = trimesh.creation.icosphere(3, radius=0.05)
+    bowl = trimesh.creation.icosphere(2, radius=0.05)
     bowl.update_faces(bowl.triangles_center[:, 2] < 0)
     assert not bowl.is_watertight
-    hulls, report = decompose(bowl, DecomposeOptions(tolerance=3e-3, max_hulls=40))
+    hulls, report = decompose(bowl, DecomposeOptions(tolerance=8e-3, max_hulls=16))
     assert_sound(hulls, 32)
     assert report.method == "coacd"
     assert depth_inside(hulls, np.array([[0, 0, -0.01], [0.015, 0, -0.02]])).max() < -0.01
@@ -123,7 +127,7 @@ def test_thin_plate_has_a_volume():
 
 
 def test_no_more_vertices_than_asked_for():
-    hulls, report = decompose(trimesh.creation.icosphere(3, radius=0.02), DecomposeOptions(max_vertices=12))
+    hulls, _ = decompose(trimesh.creation.icosphere(3, radius=0.02), DecomposeOptions(max_vertices=12))
     assert_sound(hulls, 12)
 
 
@@ -140,7 +144,7 @@ def test_failing_child_falls_back_to_the_hull_and_is_not_cached(monkeypatch, cac
     assert "bracket" in report.warning
     assert report.seconds < 20
     assert_sound(hulls)
-    assert not list(cache_folder.glob("*.npz")) if cache_folder.exists() else True
+    assert not list(cache_folder.rglob("*.npz"))
     monkeypatch.undo()
     os.environ["PHYSPOSE_CACHE"] = str(cache_folder.parent)
     assert decompose(l_shape()).report.method == "coacd"

@@ -1,0 +1,28 @@
+"""The ``physpose`` command."""
+
+import logging
+import sys
+from collections.abc import Sequence
+
+__all__ = ["main"]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns its exit code: 0 only if all went well."""
+    from physpose_torch.commands import parse
+    from physpose_torch.errors import PhysPoseError
+
+    logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
+    try:
+        command = parse(list(sys.argv[1:] if argv is None else argv))
+        return command()
+    except PhysPoseError as error:
+        print(f"physpose: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("physpose: interrupted", file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,48 @@
+"""What the commands share: progress bars and the tables they print."""
+
+import sys
+from typing import Any
+
+from tqdm import tqdm
+
+__all__ = ["describe", "progress", "table"]
+
+
+def progress(total: int, what: str, unit: str, *, quiet: bool = False) -> tqdm:
+    """A progress bar on stderr; silent if asked, or where nobody watches."""
+    return tqdm(total=total, desc=what, unit=unit, disable=quiet or not sys.stderr.isatty(), dynamic_ncols=True)
+
+
+def table(header: list[str], rows: list[list[Any]]) -> str:
+    """Plain text table; first column left, the others right."""
+    cells = [header, *([c if isinstance(c, str) else f"{c:.2f}" for c in row] for row in rows)]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
+    lines = [
+        "  ".join(c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True)))
+        for row in cells
+    ]
+    return "\n".join([lines[0], "-" * len(lines[0]), *lines[1:]])
+
+
+def describe(summary: dict[str, Any]) -> str:
+    """The summary of a refinement, in mm and percent."""
+    names = {
+        "penetration_mean_mm": "penetration, mean [mm]",
+        "penetration_p95_mm": "penetration, 95th percentile [mm]",
+        "penetrating_3mm": "more than 3 mm inside something [%]",
+        "gap_mean_mm": "gap to the support, mean [mm]",
+        "gap_p95_mm": "gap to the support, 95th percentile [mm]",
+        "floating_3mm": "more than 3 mm above the support [%]",
+    }
+    rows = []
+    for key, name in names.items():
+        factor = 100.0 if name.endswith("[%]") else 1.0
+        rows.append([name, factor * summary["before"][key], factor * summary["after"][key]])
+    head = (
+        f"{summary['refined']} of {summary['images']} images refined, {summary['rows']} poses, "
+        f"{1000 * summary['seconds_per_image']:.0f} ms an image"
+    )
+    lines = [head, "", table(["", "before", "after"], rows)]
+    if summary["problems"]:
+        lines += ["", f"{summary['images'] - summary['refined']} images kept their poses; see the messages below"]
+    return "\n".join(lines)
