@@ -44,23 +44,25 @@ class Smoothing:
 class PhysicsConfig:
     """The cost of a set of poses: pose + collision + gravity (paper Eq. 1). Lengths in metres."""
 
-    sigma_lateral: float = 0.003
+    sigma_lateral: float = 0.002
     """Standard deviation of an estimate across its viewing ray [m]."""
     sigma_ray: float = 0.0
     """Standard deviation of an estimate along its viewing ray [m], a constant part."""
-    sigma_ray_fraction: float = 0.03
+    sigma_ray_fraction: float = 0.01
     """The part of it that grows with range: RGB estimators misjudge size and depth by a factor."""
-    sigma_depth_common: float = 0.0
-    """Standard deviation of the depth factor that all estimates of one image share; 0: errors are independent."""
-    sigma_rotation: float = 0.03
-    """Standard deviation of an estimate's rotation per axis [rad]."""
-    robust: float = 9.0
+    sigma_depth_common: float = 0.03
+    """Standard deviation of the depth factor that all estimates of one image share; 0: errors are independent. Objects in
+    contact with the table then correct the depth of those that are not."""
+    sigma_rotation: float = 0.02
+    """Standard deviation of an estimate's rotation per axis [rad]. A looser one soaks up depth error as tilt."""
+    robust: float = 4.0
     """ν of the robust pose cost ½ ν log(1 + m²/ν), m the Mahalanobis distance: an estimate that physics contradicts by
     more than √ν σ is believed less and less; infinite: the paper's ½ m²."""
     pose_weight: float = 1.0
     """Weight of the pose cost; 0 switches it off."""
-    collision_weight: float = 500.0
-    """Weight ζ_C of the collision cost [1/m]; 0 switches it off."""
+    collision_weight: float = 700.0
+    """Weight ζ_C of the collision cost [1/m]; 0 switches it off. Just above the largest force of a robust pose cost across
+    the ray, ν^½ / 2σ = 500 / m: touching objects end apart, and one bad estimate does not shove good ones about."""
     gravity_weight: float = 200.0
     """Weight ζ_G of the gravity cost [1/m]; 0 switches it off. Well below ζ_C, so that a stack does not press through."""
     gravity: Literal["support", "paper"] = "support"
@@ -70,7 +72,7 @@ class PhysicsConfig:
     """Objects higher than this above any support are left alone [m]: something unseen may carry them. ``support`` only."""
     contact_tolerance: float = 1e-4
     """An object nearer than this to anything [m] counts as touching it, which switches its gravity off (δ in the paper)."""
-    softness: float = 1e-3
+    softness: float = 5e-4
     """Penetrations and gaps below this [m] cost quadratically, so that contacts settle; 0 is the paper's hinge."""
     smoothing: Smoothing = Smoothing()
     """Randomized smoothing of the distance gradients."""
@@ -103,9 +105,12 @@ class RefinerConfig:
 
     physics: PhysicsConfig = PhysicsConfig()
     """The cost."""
+    start: Literal["slide", "measured"] = "slide"
+    """Where to start: ``slide``: estimates that lie in a plane start where their viewing ray leads out of it, which is where
+    most of them end and brings grossly sunken ones within reach. ``measured``: at the estimates, as in the paper."""
     optimizer: Literal["adam", "sgd"] = "adam"
     """torch.optim.Adam on steps scaled by each estimate's σ, or plain gradient descent (the paper's)."""
-    steps: int = 100
+    steps: int = 60
     """Largest number of steps."""
     learning_rate: float = 0.15
     """Adam: first step, in σ. sgd: the paper's step on the cost's gradient."""
@@ -124,6 +129,8 @@ class RefinerConfig:
         _check_positive(self, "learning_rate", "max_step")
         if not (isinstance(self.steps, int) and self.steps >= 0):
             raise InvalidInputError(f"RefinerConfig.steps = {self.steps}, expected an integer >= 0")
+        if self.start not in ("slide", "measured"):
+            raise InvalidInputError(f"RefinerConfig.start = {self.start!r}, expected 'slide' or 'measured'")
         if self.optimizer not in ("adam", "sgd") or self.decay not in ("cosine", "none"):
             raise InvalidInputError(
                 f"RefinerConfig.optimizer = {self.optimizer!r}, decay = {self.decay!r}: "
@@ -141,6 +148,7 @@ class RefinerConfig:
             sigma_lateral=0.05,
             sigma_ray=0.49,
             sigma_ray_fraction=0.0,
+            sigma_depth_common=0.0,
             sigma_rotation=0.26,
             collision_weight=1.0,
             gravity_weight=1.0,
@@ -149,4 +157,13 @@ class RefinerConfig:
             robust=float("inf"),
             smoothing=Smoothing("gaussian"),
         )
-        return cls(physics, "sgd", steps=3000, learning_rate=1e-4, decay="none", max_gradient=1.0, tolerance=0.0)
+        return cls(
+            physics,
+            start="measured",
+            optimizer="sgd",
+            steps=3000,
+            learning_rate=1e-4,
+            decay="none",
+            max_gradient=1.0,
+            tolerance=0.0,
+        )

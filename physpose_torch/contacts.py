@@ -12,7 +12,7 @@ from physpose_torch.distance.plane import half_space_distance
 from physpose_torch.distance.smoothing import tangent_basis
 from physpose_torch.scene import Scene
 
-__all__ = ["Contacts", "Drops", "find_contacts", "find_drops", "find_static_gaps"]
+__all__ = ["Contacts", "Drops", "find_contacts", "find_drops", "find_static_gaps", "object_heights"]
 
 SUPPORT_SLOPE = 0.3
 """Least n·g at which a contact carries an object; a wall that is grazed on the way down does not."""
@@ -99,6 +99,16 @@ def find_contacts(
     variance[planar] = plane_variance(poses, scene, bodies[planar, 0], bodies[planar, 1] - n_entities, acts)
     index = (x.to(device) for x in (pair, bodies[:, 0], bodies[:, 1], *moves))
     return Contacts(torch.cat([distance, below]), *index, variance)
+
+
+def object_heights(poses: Tensor, scene: Scene) -> Tensor:
+    """Signed distances (E,) of whole objects to planes [m], in the order of ``scene.plane_pairs``."""
+    pairs = scene.plane_pairs
+    instance, plane = _plane_instances(scene)
+    height = _above_planes(scene.entity_poses(poses), scene, instance, plane, None)
+    count = scene.instance_start.diff()[pairs[:, 0]]
+    pair = torch.repeat_interleave(torch.arange(len(pairs)), count).to(poses.device)
+    return poses.new_full((len(pairs),), torch.inf).scatter_reduce(0, pair, height.detach(), "amin")
 
 
 def find_drops(

@@ -58,7 +58,7 @@ def fields(path):
 
 
 def test_refining_brings_sunken_objects_onto_the_table(dataset):
-    assert refine(dataset, "--json", dataset / "s.json") == 0
+    assert refine(dataset, "--json", dataset / "s.json", "--plane-sigma-mm", "0") == 0
     summary = json.loads((dataset / "s.json").read_text())
     assert summary["before"]["penetration_mean_mm"] > 5
     assert summary["after"]["penetration_mean_mm"] < 0.2

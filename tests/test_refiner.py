@@ -128,7 +128,7 @@ def test_alternatives_end_where_each_would_alone_and_push_nobody(table, box, can
     refiner = short(30)
     crowded = refiner(table.poses(*rows), three, scores=scores)
     alone = refiner(table.poses(*rows[:2]), two, scores=scores[:2])
-    assert torch.equal(crowded.poses[:2], alone.poses)
+    torch.testing.assert_close(crowded.poses[:2], alone.poses, atol=1e-9, rtol=0)  # sums run in another order
     assert float(motion(crowded.poses[2], table.at(*rows[2]))) > 1e-3
 
 
@@ -200,8 +200,8 @@ def test_the_best_hypothesis_is_chosen_image_by_image(table, box):
 
 
 def test_each_image_stops_on_its_own(table, box):
-    """One image is at rest from the start, one has work to do, one is empty."""
-    scenes = [Scene.tabletop([box], table.plane)] * 2 + [Scene.tabletop([], table.plane)]
+    """In one image nothing acts on the object, one has work to do, one is empty."""
+    scenes = [Scene([box]), Scene.tabletop([box], table.plane), Scene.tabletop([], table.plane)]
     running = []
     result = PhysPoseRefiner()(
         table.poses((0, 0, 0.02), (0, 0, 0.01)),
@@ -210,7 +210,7 @@ def test_each_image_stops_on_its_own(table, box):
     )
     steps = result.steps.tolist()
     assert steps[2] == 0
-    assert steps[0] < steps[1] <= 100
+    assert steps[0] == 10 < steps[1]
     assert result.converged.tolist()[::2] == [True, True]
     assert running == [2] * steps[0] + [1] * (steps[1] - steps[0])
 

@@ -82,13 +82,12 @@ class ImageScene:
         return f"scene {self.scene_id} image {self.im_id}"
 
 
-def plane_of(record: PlaneRecord) -> Plane:
-    """The plane of a planes file, with its covariance where the file states both σ."""
-    covariance = None
-    if record.sigma_deg is not None or record.sigma is not None:
-        tilt, offset = np.deg2rad(record.sigma_deg or 0.0), record.sigma or 0.0
-        covariance = torch.diag(torch.tensor([tilt**2, tilt**2, offset**2], dtype=torch.float64))
-    return Plane(record.normal, torch.tensor(record.offset, dtype=torch.float64), covariance)
+def plane_of(record: PlaneRecord, *, sigma: float = 0.0) -> Plane:
+    """The plane of a planes file; where the file states no σ of its height it is ``sigma`` [m], and no tilt is none."""
+    tilt, offset = np.deg2rad(record.sigma_deg or 0.0), sigma if record.sigma is None else record.sigma
+    covariance = torch.diag(torch.tensor([tilt**2, tilt**2, offset**2], dtype=torch.float64))
+    position = torch.tensor(record.offset, dtype=torch.float64)
+    return Plane(record.normal, position, covariance if tilt > 0 or offset > 0 else None)
 
 
 def image_scenes(
@@ -96,6 +95,7 @@ def image_scenes(
     library: BodyLibrary,
     *,
     planes: Mapping[tuple[int, int], PlaneRecord] | None = None,
+    plane_sigma: float = 0.0,
     statics: list[StaticRecord] = (),
     counts: Mapping[tuple[int, int, int], int] | None = None,
     broken: Mapping[tuple[int, int], list[str]] | None = None,
@@ -108,6 +108,7 @@ def image_scenes(
         library: bodies by obj_id.
         planes: table plane by (scene_id, im_id); an image without one gets no gravity and is refined by collisions only,
             and says so if ``planes`` is given at all. None: collisions only, everywhere.
+        plane_sigma: σ of the height of planes that state none [m].
         statics: static bodies, see :func:`physpose_torch.bop.formats.read_statics`.
         counts: (scene_id, im_id, obj_id) → number of instances, from a targets file.
         broken: images with rows or planes that cannot be used, and why; they are left alone.
@@ -126,19 +127,19 @@ def image_scenes(
         if image.problems:
             continue
         try:
-            image.scene = _scene(image, estimates, library, planes, statics, counts or {})
+            image.scene = _scene(image, estimates, library, planes, plane_sigma, statics, counts or {})
         except PhysPoseError as error:
             image.problems.append(f"{image.name}: {error}")
     return out
 
 
-def _scene(image: ImageScene, estimates: Estimates, library: BodyLibrary, planes, statics, counts) -> Scene:
+def _scene(image, estimates, library, planes, plane_sigma, statics, counts) -> Scene:
     key = (image.scene_id, image.im_id)
     obj_ids = estimates.obj_id[image.rows].tolist()
     objects = [library.model(i) for i in obj_ids]
     standing, gravity = [], None
     if planes is not None:
-        plane = plane_of(planes[key])
+        plane = plane_of(planes[key], sigma=plane_sigma)
         standing.append(Static(plane))
         gravity = -plane.normal
     for record in statics:

@@ -43,6 +43,9 @@ class Refine:
     """Result file to write."""
     planes: Path | None = None
     """Table planes: {scene: {image: {"normal": [3], "offset_mm": x}}} or {"R": 3x3, "t": [m]}. Without: collisions only."""
+    plane_sigma_mm: float = 2.5
+    """Standard deviation of the height of planes whose entry states none; contacts are as soft. 0: they are exact. Scans,
+    true poses and tables agree to a few mm, not better; with an exact plane depth errors of one object turn into tilt."""
     statics: Path | None = None
     """Static meshes or boxes with their poses, JSON."""
     models: Path | None = None
@@ -67,6 +70,8 @@ class Refine:
     """No progress bar and no summary."""
 
     def __call__(self) -> int:
+        if not self.plane_sigma_mm >= 0:
+            raise InvalidInputError(f"--plane-sigma-mm {self.plane_sigma_mm}: expected a number >= 0")
         if self.batch < 1 or self.every < 1:
             raise InvalidInputError(f"--batch {self.batch}, --every {self.every}: expected positive numbers")
         estimates = read_estimates(self.estimates)
@@ -127,7 +132,7 @@ class Refine:
         keys = [k for k in {**keys, **broken} if not self.scenes or k[0] in self.scenes]
         wanted = set(keys[:: self.every])
         images = image_scenes(
-            estimates, BodyLibrary(dataset), planes=planes, statics=statics, counts=counts, broken=broken, wanted=wanted
+            estimates, BodyLibrary(dataset), planes=planes, plane_sigma=self.plane_sigma_mm / 1000, statics=statics, counts=counts, broken=broken, wanted=wanted
         )
         rows_read = {(i.scene_id, i.im_id) for i in images}
         nothing = np.zeros(0, dtype=np.int64)

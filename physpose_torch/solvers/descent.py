@@ -9,6 +9,7 @@ from torch import Tensor
 
 from physpose_torch import se3
 from physpose_torch.config import RefinerConfig
+from physpose_torch.contacts import object_heights
 from physpose_torch.losses import PhysicsTerms, physics_terms, prior_loss
 from physpose_torch.prior import PosePrior
 from physpose_torch.scene import Scene
@@ -19,6 +20,8 @@ STILL_STEPS = 10
 """An image stops after this many steps on end without motion; finished images leave the batch at these intervals."""
 ADAM_BETAS = (0.8, 0.95)
 """Short memories: contacts come and go within a few steps."""
+LEAST_SLOPE = 0.2
+"""Sine of the least angle between viewing ray and plane at which an object is slid along its ray."""
 ADAM_EPS = 0.1
 """In units of 1/σ. Forces far below one σ of the prior are not blown up to full steps: a consistent scene stays put."""
 
@@ -31,7 +34,7 @@ class Descent(NamedTuple):
     converged: Tensor
     """(I,) bool: it stopped before the step limit."""
     trajectory: Tensor | None
-    """(steps + 1, N, 4, 4), the start included."""
+    """(steps + 1, N, 4, 4), from the estimates on."""
 
 
 def descend(
@@ -48,14 +51,14 @@ def descend(
     sure; for plain gradient descent L is the identity, as in the paper.
 
     Args:
-        prior: the flat estimates and their uncertainty, float64; the descent starts there.
+        prior: the flat estimates and their uncertainty, float64.
         scene: the flat scene.
         acts: (N,) bool, see :func:`physpose_torch.losses.acting`.
         config: optimizer options.
         callback: called with step, poses (N, 4, 4) and terms of the images still running before each step.
     """
     n, n_images = len(scene), scene.n_images
-    poses = prior.measured.clone()
+    poses = out_of_planes(prior, scene) if config.start == "slide" else prior.measured.clone()
     radius = scene.object_radius.to(poses)
     scale = _principal_scale(prior) if config.optimizer == "adam" else torch.eye(6).to(poses).expand(n, 6, 6)
     x = torch.zeros(n, 6, dtype=poses.dtype, device=poses.device, requires_grad=True)
@@ -74,7 +77,7 @@ def descend(
     done = torch.bincount(scene.image, minlength=n_images) == 0  # nothing in an empty image: nothing to do
     steps[done] = 0
     active, rows, active_prior = _select(scene, prior, ~done)
-    trajectory = [poses.clone()] if config.keep_trajectory else None
+    trajectory = [prior.measured.clone()] if config.keep_trajectory else None
     for step in range(config.steps):
         if bool(done.all()):
             break
@@ -115,6 +118,26 @@ def descend(
             done = done | finished
             active, rows, active_prior = _select(scene, prior, ~done)
     return Descent(poses, steps, done, torch.stack(trajectory) if trajectory is not None else None)
+
+
+def out_of_planes(prior: PosePrior, scene: Scene) -> Tensor:
+    """The estimates (N, 4, 4), those that lie in a plane slid along their viewing rays until they touch it.
+
+    Estimators misjudge depth most of all, so this is where most objects end; the descent has only the rest to do. An object
+    that is seen along the plane stays where it is.
+    """
+    poses = prior.measured.clone()
+    if not len(scene.planes):
+        return poses
+    height = object_heights(poses, scene)
+    who, plane = scene.plane_pairs.to(poses.device).unbind(1)
+    slope = -(scene.plane_normal.to(poses)[plane] * torch.nn.functional.normalize(prior.ray, dim=-1)[who]).sum(-1)
+    slide = torch.where(slope > LEAST_SLOPE, (-height).clamp_min(0.0) / slope.clamp_min(LEAST_SLOPE), 0.0)
+    slide = poses.new_zeros(len(poses)).scatter_reduce(0, who, slide, "amax")
+    range_ = torch.linalg.vector_norm(prior.ray, dim=-1)
+    slide = torch.where(slide < 0.9 * range_, slide, 0.0)  # never behind the camera
+    poses[:, :3, 3] -= (slide / range_)[:, None] * prior.ray
+    return poses
 
 
 def _select(scene: Scene, prior: PosePrior, running: Tensor) -> tuple[Scene, Tensor, PosePrior]:
