@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from physpose_torch.config import RefinerConfig
-from physpose_torch.geometry.body import Body, Plane
+from physpose_torch.geometry.body import Body, Plane, load_mesh
+from physpose_torch.geometry.decompose import decompose_many
 from physpose_torch.household import HouseholdScene, household_meshes, household_scene, perturb_like_estimator
 from physpose_torch.refiner import PhysPoseRefiner, Refinement
 from physpose_torch.report import PhysicsReport, physics_report
@@ -61,13 +62,12 @@ class Demo:
         )
 
 
-def household_bodies(*, on_body: Callable[[str], None] = lambda name: None, cache: bool = True) -> dict[str, Body]:
-    """Bodies of the generated household meshes; decomposed once, then from the cache."""
-    bodies = {}
-    for name, mesh in household_meshes().items():
-        bodies[name] = Body.from_mesh(mesh, label=name, cache=cache)
+def household_bodies(*, on_body: Callable[[str], None] = lambda name: None) -> dict[str, Body]:
+    """Bodies of the generated household meshes; decomposed once, on all cores, then from the cache."""
+    meshes = household_meshes()
+    for name, _ in decompose_many({k: load_mesh(m, label=k) for k, m in meshes.items()}):
         on_body(name)
-    return bodies
+    return {name: Body.from_mesh(mesh, label=name) for name, mesh in meshes.items()}
 
 
 def run_demo(

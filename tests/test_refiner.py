@@ -411,3 +411,26 @@ def test_a_wrong_input_is_refused_by_name(table, box, can):
     ]:
         with pytest.raises(InvalidInputError, match=message):
             PhysPoseRefiner()(wrong, scene, **options)
+
+
+def test_a_sunken_object_starts_where_its_viewing_ray_leaves_the_table(table, box):
+    """10 cm along the ray into the table, far beyond what sixty steps could undo: the slide alone brings it back."""
+    truth = table.poses((0.05, 0.02, 0.02))
+    ray = torch.nn.functional.normalize(truth[0, :3, 3], dim=0)
+    sunk = truth.clone()
+    sunk[0, :3, 3] += 0.3 * ray
+    scene = Scene.tabletop([box], table.plane)
+    no_steps = PhysPoseRefiner(RefinerConfig(steps=0))(sunk, scene).poses
+    torch.testing.assert_close(no_steps, truth, atol=1e-9, rtol=0)
+    stay = PhysPoseRefiner(RefinerConfig(steps=0, start="measured"))(sunk, scene).poses
+    assert torch.equal(stay, sunk)
+
+
+def test_an_object_above_the_table_or_seen_along_it_does_not_start_elsewhere(table, box):
+    above = table.poses((0, 0, 0.08))
+    scene = Scene.tabletop([box], table.plane)
+    assert torch.equal(PhysPoseRefiner(RefinerConfig(steps=0))(above, scene).poses, above)
+    edge_on = Plane(torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64), torch.tensor(-0.02, dtype=torch.float64))
+    ahead = torch.eye(4, dtype=torch.float64)[None].clone()
+    ahead[0, :3, 3] = torch.tensor([0.0, 0.03, 0.8])
+    assert torch.equal(PhysPoseRefiner(RefinerConfig(steps=0))(ahead, Scene.tabletop([box], edge_on)).poses, ahead)

@@ -132,7 +132,14 @@ class Refine:
         keys = [k for k in {**keys, **broken} if not self.scenes or k[0] in self.scenes]
         wanted = set(keys[:: self.every])
         images = image_scenes(
-            estimates, BodyLibrary(dataset), planes=planes, plane_sigma=self.plane_sigma_mm / 1000, statics=statics, counts=counts, broken=broken, wanted=wanted
+            estimates,
+            BodyLibrary(dataset),
+            planes=planes,
+            plane_sigma=self.plane_sigma_mm / 1000,
+            statics=statics,
+            counts=counts,
+            broken=broken,
+            wanted=wanted,
         )
         rows_read = {(i.scene_id, i.im_id) for i in images}
         nothing = np.zeros(0, dtype=np.int64)
