@@ -31,7 +31,7 @@ class Refinement:
     terms: PhysicsTerms
     """Costs (..., N) at the refined poses."""
     trajectory: Tensor | None
-    """(steps + 1, ..., N, 4, 4) if the config keeps it."""
+    """(steps + 1, ..., N, 4, 4) if the config keeps it, from the estimates on; the slide out of planes is in the first step."""
     steps: Tensor
     """(..., I) steps that each image took."""
     converged: Tensor

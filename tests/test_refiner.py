@@ -242,7 +242,7 @@ def test_the_trajectory_starts_at_the_estimate_and_ends_at_the_result(table, box
 def test_the_callback_sees_each_step_before_it_is_taken(table, box):
     seen = []
     pose = table.poses((0, 0, 0.01))
-    result = short(4, keep_trajectory=True)(
+    result = short(4, keep_trajectory=True, start="measured")(
         pose, Scene.tabletop([box], table.plane), callback=lambda *args: seen.append(args)
     )
     assert [step for step, _, _ in seen] == [0, 1, 2, 3]
@@ -266,7 +266,7 @@ def test_terms_and_report_are_those_of_the_refined_poses(table, box, can):
 
 def test_no_step_is_longer_than_the_cap(table, box):
     """With a prior as loose as that, uncapped steps would be metres."""
-    config = RefinerConfig(keep_trajectory=True, steps=10, max_step=0.002)
+    config = RefinerConfig(keep_trajectory=True, steps=10, max_step=0.002, start="measured")
     loose = 100.0 * torch.eye(6, dtype=torch.float64)
     pose = table.poses((0, 0, -0.1))
     path = PhysPoseRefiner(config)(pose, Scene.tabletop([box], table.plane), measured_covariance=loose).trajectory
