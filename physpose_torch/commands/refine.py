@@ -45,7 +45,7 @@ class Refine:
     """Table planes: {scene: {image: {"normal": [3], "offset_mm": x}}} or {"R": 3x3, "t": [m]}. Without: collisions only."""
     plane_sigma_mm: float = 2.5
     """Standard deviation of the height of planes whose entry states none; contacts are as soft. 0: they are exact. Scans,
-    true poses and tables agree to a few mm, not better; with an exact plane depth errors of one object turn into tilt."""
+    true poses and tables agree to a few mm, not better."""
     statics: Path | None = None
     """Static meshes or boxes with their poses, JSON."""
     models: Path | None = None
