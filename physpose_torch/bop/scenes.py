@@ -1,6 +1,5 @@
 """From a BOP result file to scenes and back: one scene an image, with what could not be used set aside."""
 
-import logging
 from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
 
@@ -16,8 +15,6 @@ from physpose_torch.geometry.body import Body, Plane
 from physpose_torch.scene import Scene, Static
 
 __all__ = ["BodyLibrary", "ImageScene", "image_scenes", "plane_of"]
-
-logger = logging.getLogger("physpose_torch")
 
 MM = 1e-3
 
