@@ -1,6 +1,6 @@
 """Which estimates are alternatives of one physical object rather than objects of their own."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -34,27 +34,35 @@ def find_alternatives(
     """
     poses = poses.detach().double().cpu()
     counts = counts or {}
-    group = list(range(len(scene)))
-    leaders: dict[tuple[int, str], list[int]] = {}
-    centers = se3.apply(poses, scene.object_center[:, None])[:, 0]
+    rows_of: dict[tuple[int, str], list[int]] = {}
+    images = scene.image.tolist()
     for i in torch.argsort(scores.double().cpu(), descending=True, stable=True).tolist():
-        key = (int(scene.image[i]), scene.objects[i].label)
-        better = leaders.setdefault(key, [])
-        if not better:
-            better.append(i)
-            continue
-        body = scene.objects[i]
-        distance = torch.linalg.vector_norm(centers[better] - centers[i], dim=1)
-        nearest = better[int(distance.argmin())]
-        near = float(distance.min()) < 0.5 * float((body.upper - body.lower).min())
-        known = counts.get(key)
-        if (known is not None and len(better) >= known) or (
-            near and overlap_share(body, poses[i], poses[nearest]) > DEEP
-        ):
-            group[i] = nearest
-        else:
-            better.append(i)
+        rows_of.setdefault((images[i], scene.objects[i].label), []).append(i)
+    group = list(range(len(scene)))
+    for key, rows in rows_of.items():
+        if len(rows) > 1:
+            leaders = _leaders([scene.objects[i] for i in rows], poses[rows], counts.get(key))
+            for i, leader in zip(rows, leaders, strict=True):
+                group[i] = rows[leader]
     return torch.tensor(group, dtype=torch.long)
+
+
+def _leaders(bodies: Sequence[Body], poses: Tensor, known: int | None) -> list[int]:
+    """For each of the rows of one label, the best first, the row that it is an alternative of, or itself."""
+    centers = se3.apply(poses, torch.stack([body.center for body in bodies])[:, None])[:, 0]
+    distance = torch.linalg.vector_norm(centers[:, None] - centers, dim=2).tolist()
+    leaders, distinct = [0], [0]
+    for i, body in enumerate(bodies[1:], start=1):
+        nearest = min(distinct, key=distance[i].__getitem__)
+        if (known is not None and len(distinct) >= known) or (
+            distance[i][nearest] < 0.5 * float((body.upper - body.lower).min())
+            and overlap_share(body, poses[i], poses[nearest]) > DEEP
+        ):
+            leaders.append(nearest)
+        else:
+            leaders.append(i)
+            distinct.append(i)
+    return leaders
 
 
 def overlap_share(body: Body, T_a: Tensor, T_b: Tensor) -> float:
@@ -63,6 +71,9 @@ def overlap_share(body: Body, T_a: Tensor, T_b: Tensor) -> float:
     inner = parts.center[:, None] + SHRINK * (parts.padded - parts.center[:, None])
     points = torch.cat([parts.center, inner[parts.padded_mask]])
     points = se3.apply(se3.inverse(T_b) @ T_a, points)
-    height = torch.einsum("pfi,ki->kpf", parts.face_normals, points)
-    top = torch.einsum("pfi,pki->pfk", parts.face_normals, parts.padded).amax(2)
-    return float((height <= top).all(2).any(1).double().mean())
+    # only points in a part's bounds are held against its faces: all together would be hundreds of megabytes
+    bounded = (points[:, None] >= parts.lower) & (points[:, None] <= parts.upper)
+    point, part = bounded.all(2).nonzero().unbind(1)
+    height = (parts.face_normals[part] @ points[point, :, None])[:, :, 0]
+    inside = (height <= parts.face_offsets[part]).all(1)
+    return len(point[inside].unique()) / len(points)

@@ -1,6 +1,7 @@
 """What is in the images: movable objects, static bodies and planes, gravity; many images flat in one batch."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -41,6 +42,23 @@ class Static:
             se3.check_rigid(self.T_camera_body, f"T_camera_body of static {self.shape.label!r}")
         else:
             raise InvalidInputError(f"Static.shape is a {type(self.shape).__name__}, expected a Body or a Plane")
+
+    def in_image(self, image: int) -> "Static":
+        """The same in another image; it has been checked already."""
+        moved = copy(self)
+        object.__setattr__(moved, "image", image)
+        return moved
+
+
+class _Packing:
+    """Different bodies, each packed once; a scene shares it with what is made of it, and so all that is known of its parts."""
+
+    def __init__(self, bodies: Iterable[Body]) -> None:
+        self.number = {body: i for i, body in enumerate(dict.fromkeys(bodies))}
+
+    @cached_property
+    def parts(self) -> ConvexParts:
+        return ConvexParts.cat([body.parts for body in self.number])
 
 
 class Scene:
@@ -101,37 +119,52 @@ class Scene:
         objects, statics, gravity, image, same, images, n = [], [], [], [], [], 0, 0
         for s in scenes:
             objects += s.objects
-            statics += [Static(x.shape, x.T_camera_body, x.image + images) for x in s.statics]
+            statics += [x.in_image(x.image + images) for x in s.statics]
             gravity.append(s.gravity.double().cpu())
             image.append(s.image + images)
             same.append(s.same_object + n)
             images, n = images + s.n_images, n + len(s.objects)
         if not scenes:
             return cls((), n_images=0)
-        return cls(
-            objects,
-            statics,
-            gravity=torch.cat(gravity),
-            image=torch.cat(image),
-            n_images=images,
-            same_object=torch.cat(same),
-        )
+        whole = cls._of_checked(objects, statics, torch.cat(gravity), torch.cat(image), images, torch.cat(same))
+        if all(s._packing is scenes[0]._packing for s in scenes):  # hypotheses of one scene
+            whole._packing = scenes[0]._packing
+        return whole
 
     def select(self, images: Tensor) -> tuple["Scene", Tensor]:
         """The scene of some images (K,) long, renumbered in that order, and the indices (M,) of their objects here."""
         images = torch.as_tensor(images, dtype=torch.long)
         new = torch.full((self.n_images,), -1)
         new[images] = torch.arange(len(images))
-        rows = (new[self.image] >= 0).nonzero()[:, 0]
-        scene = Scene(
+        image = new[self.image]
+        rows = (image >= 0).nonzero()[:, 0]
+        place = new.tolist()
+        scene = self._of_checked(
             [self.objects[i] for i in rows.tolist()],
-            [Static(s.shape, s.T_camera_body, int(new[s.image])) for s in self.statics if new[s.image] >= 0],
-            gravity=self.gravity[images],
-            image=new[self.image[rows]],
-            n_images=len(images),
-            same_object=self.same_object[rows],
+            [s.in_image(place[s.image]) for s in self.statics if place[s.image] >= 0],
+            self.gravity[images],
+            image[rows],
+            len(images),
+            self.same_object[rows],
         )
+        scene._packing = self._packing
         return scene, rows
+
+    @classmethod
+    def _of_checked(
+        cls,
+        objects: Sequence[Body],
+        statics: Sequence[Static],
+        gravity: Tensor,
+        image: Tensor,
+        n_images: int,
+        same_object: Tensor,
+    ) -> "Scene":
+        """A scene of what other scenes have checked."""
+        scene = cls.__new__(cls)
+        scene.objects, scene.statics, scene.gravity = tuple(objects), tuple(statics), gravity
+        scene.image, scene.n_images, scene.same_object = image, n_images, same_object
+        return scene
 
     def __len__(self) -> int:
         return len(self.objects)
@@ -154,21 +187,20 @@ class Scene:
         return [s for s in self.statics if isinstance(s.shape, Plane)]
 
     @cached_property
-    def _unique(self) -> tuple[list[Body], Tensor]:
-        bodies: dict[int, int] = {}
-        unique: list[Body] = []
-        index = []
-        for body in [*self.objects, *(s.shape for s in self.static_bodies)]:
-            if id(body) not in bodies:
-                bodies[id(body)] = len(unique)
-                unique.append(body)
-            index.append(bodies[id(body)])
-        return unique, torch.tensor(index, dtype=torch.long)
+    def _packing(self) -> _Packing:
+        return _Packing([*self.objects, *(s.shape for s in self.static_bodies)])
 
     @cached_property
+    def _entity_body(self) -> Tensor:
+        """(N + S,) number of every entity's body among those that are packed."""
+        number = self._packing.number
+        bodies = [*self.objects, *(s.shape for s in self.static_bodies)]
+        return torch.tensor([number[body] for body in bodies], dtype=torch.long)
+
+    @property
     def parts(self) -> ConvexParts:
-        """Convex parts of the different bodies, each body once."""
-        return ConvexParts.cat([b.parts for b in self._unique[0]])
+        """Convex parts of the different bodies, each body once; those of a selection are still those of the whole."""
+        return self._packing.parts
 
     @cached_property
     def entity_image(self) -> Tensor:
@@ -178,20 +210,18 @@ class Scene:
     @cached_property
     def instance_start(self) -> Tensor:
         """(N + S + 1,) long: entity e has the instances ``instance_start[e]:instance_start[e + 1]``."""
-        counts = self.parts.part_start.diff()[self._unique[1]]
+        counts = self.parts.part_start.diff()[self._entity_body]
         return torch.cat([counts.new_zeros(1), counts.cumsum(0)])
 
     @cached_property
     def instance_entity(self) -> Tensor:
         """(Q,) entity of every part instance."""
-        return torch.repeat_interleave(torch.arange(len(self._unique[1])), self.instance_start.diff())
+        return _ranges(self.instance_start[:-1], self.instance_start.diff())[0]
 
     @cached_property
     def instance_part(self) -> Tensor:
         """(Q,) index of every instance into :attr:`parts`."""
-        first = self.parts.part_start[self._unique[1]]
-        within = torch.arange(len(self.instance_entity)) - self.instance_start[self.instance_entity]
-        return first[self.instance_entity] + within
+        return _ranges(self.parts.part_start[self._entity_body], self.instance_start.diff())[1]
 
     @cached_property
     def has_static(self) -> Tensor:
@@ -230,25 +260,23 @@ class Scene:
     @cached_property
     def object_center(self) -> Tensor:
         """(N, 3) centre of the bounds of each object, object frame [m]."""
-        return _stack([b.center for b in self._unique[0]], (0, 3))[self._unique[1][: len(self)]]
+        return _stack([b.center for b in self._packing.number], (0, 3))[self._entity_body[: len(self)]]
 
     @cached_property
     def object_radius(self) -> Tensor:
         """(N,) radius of each object about :attr:`object_center` [m]."""
-        radius = torch.tensor([b.radius for b in self._unique[0]], dtype=torch.float64)
-        return radius[self._unique[1][: len(self)]]
+        radius = torch.tensor([b.radius for b in self._packing.number], dtype=torch.float64)
+        return radius[self._entity_body[: len(self)]]
 
     @cached_property
     def entity_pairs(self) -> Tensor:
         """(E, 2) pairs of entities that may meet: of one image, at least one movable, not alternatives of one object."""
         n = len(self)
         order = torch.argsort(self.entity_image, stable=True)
-        pairs = []
-        counts = torch.bincount(self.entity_image, minlength=self.n_images).tolist()
-        for members in order.split(counts):
-            i, j = torch.triu_indices(len(members), len(members), 1)
-            pairs.append(torch.stack([members[i], members[j]], dim=1))
-        pairs = torch.cat([torch.zeros(0, 2, dtype=torch.long), *pairs]).sort(dim=1).values
+        end = torch.bincount(self.entity_image, minlength=self.n_images).cumsum(0)[self.entity_image[order]]
+        later = torch.arange(1, len(order) + 1)
+        first, second = _ranges(later, end - later)  # each with all that come after it in its image
+        pairs = torch.stack([order[first], order[second]], dim=1)
         movable = pairs[:, 0] < n
         same = torch.full((len(self.entity_image),), -1)
         same[:n] = self.same_object
@@ -258,7 +286,10 @@ class Scene:
     @cached_property
     def plane_pairs(self) -> Tensor:
         """(E, 2) pairs (object, plane) of one image."""
-        return (self.image[:, None] == self.plane_image[None]).nonzero()
+        order = torch.argsort(self.plane_image, stable=True)
+        count = torch.bincount(self.plane_image, minlength=self.n_images)
+        who, which = _ranges((count.cumsum(0) - count)[self.image], count[self.image])
+        return torch.stack([who, order[which]], dim=1)
 
     def entity_poses(self, poses: Tensor) -> Tensor:
         """(N + S, 4, 4): the objects' poses, then those of the static bodies."""
@@ -292,6 +323,13 @@ def _index(value: Tensor, n: int, name: str) -> Tensor:
     if n and int(value.min()) < 0:
         raise InvalidInputError(f"{name} has negative entries")
     return value
+
+
+def _ranges(start: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
+    """For every i the ``count[i]`` numbers from ``start[i]`` on, one range after another: the i of each, and the number."""
+    owner = torch.repeat_interleave(count)
+    within = torch.arange(len(owner)) - (count.cumsum(0) - count)[owner]
+    return owner, start[owner] + within
 
 
 def _stack(values: list[Tensor], shape: tuple[int, ...]) -> Tensor:

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from physpose_torch import se3
 from physpose_torch.alternatives import find_alternatives, overlap_share
 from physpose_torch.geometry.body import Body
 from physpose_torch.scene import Scene
@@ -99,3 +100,19 @@ def test_a_body_is_wholly_inside_itself_and_not_at_all_beside_itself(table, can,
     for body in (can, angle):
         assert overlap_share(body, table.at(), table.at()) == 1.0
         assert overlap_share(body, table.at(), table.at(0.2)) == 0.0
+
+
+def test_the_share_is_that_of_all_points_held_against_all_faces(table, can, angle):
+    """Points outside of a part's bounds are left out beforehand; that must not change who is inside."""
+    generator = torch.Generator().manual_seed(0)
+    for body in (can, angle):
+        parts = body.parts
+        inner = parts.center[:, None] + 0.7 * (parts.padded - parts.center[:, None])
+        points = torch.cat([parts.center, inner[parts.padded_mask]])
+        for _ in range(20):
+            shift = (0.02 * torch.randn(2, 3, generator=generator)).tolist()
+            T = table.at(*shift[0], turn=[20 * x for x in shift[1]])
+            moved = se3.apply(se3.inverse(table.at()) @ T, points)
+            height = torch.einsum("pfi,ki->kpf", parts.face_normals, moved)
+            inside = (height <= parts.face_offsets).all(2).any(1)
+            assert overlap_share(body, T, table.at()) == pytest.approx(float(inside.double().mean()), abs=1e-12)

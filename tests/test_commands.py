@@ -1,6 +1,7 @@
 """The ``physpose`` command on a small BOP folder: what goes in comes out, better or untouched, and the exit code tells."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -132,6 +133,62 @@ def test_an_image_without_plane_keeps_its_poses_and_is_named(dataset, caplog):
     assert old[3] == new[3]
     assert old[1] != new[1]
     assert "image 7" in caplog.text
+
+
+def test_problems_are_told_in_file_order_whatever_is_refined_in_between(dataset):
+    """Images 3 and 7 can be refined; 5 has an unknown object, 9 no plane, of 11 and 6 no row can be read, one row is lost."""
+    header, *rows = (dataset / "est.csv").read_text().splitlines()
+    lost = [csv_row(2, im, 1, "nan", standing(0, 0, 50)) for im in (11, 6)]
+    alone = [csv_row(2, im, obj, 0.9, standing(0, 0, 50)) for im, obj in ((5, 77), (9, 1))]
+    planes = json.loads((dataset / "planes.json").read_text())
+    planes["2"] |= {im: planes["2"]["3"] for im in ("5", "11", "6")}
+    (dataset / "planes.json").write_text(json.dumps(planes))
+    (dataset / "bad.csv").write_text(
+        "\n".join([header, alone[0], *rows[:2], lost[0], "gibberish", *alone[1:], lost[1], rows[2]])
+    )
+    for batch in (1, 2, 16):
+        assert refine(dataset, "--json", dataset / "s.json", "--batch", batch, estimates="bad.csv") == 1
+        summary = json.loads((dataset / "s.json").read_text())
+        assert (summary["images"], summary["refined"], summary["rows"]) == (7, 2, 3)
+        words = ["object 77", "image 9: no plane", "line 5: score", "line 8: score", "line 6: 1 fields"]
+        assert len(summary["problems"]) == len(words)
+        assert all(word in problem for word, problem in zip(words, summary["problems"], strict=True))
+        old, new = ((dataset / f).read_text().splitlines() for f in ("bad.csv", "out.csv"))
+        assert [a == b for a, b in zip(old, new, strict=True)] == [True, True, False, False, *[True] * 4, False]
+
+
+def test_batches_are_of_usable_images_and_of_what_stands_between_them():
+    from physpose_torch.commands.refine import _batches
+
+    def numbers(usable, size):
+        images = (SimpleNamespace(number=k, scene=object() if x else None) for k, x in enumerate(usable))
+        return [[i.number for i in batch] for batch in _batches(images, size)]
+
+    assert numbers([1, 0, 1, 1, 0, 0, 1, 1, 0], 2) == [[0, 1, 2], [3, 4, 5, 6], [7, 8]]
+    assert numbers([0, 0], 2) == [[0, 1]]
+    assert numbers([1, 1], 2) == [[0, 1]]
+    assert numbers([], 2) == []
+
+
+def test_the_images_of_a_batch_are_made_after_the_one_before_is_refined(dataset, monkeypatch):
+    """So memory does not grow with the file."""
+    from physpose_torch.commands import refine as module
+
+    events, refine_batch, scenes = [], module._refine, module.image_scenes
+
+    def making(*args, **options):
+        for image in scenes(*args, **options):
+            events.append(("made", image.im_id))
+            yield image
+
+    def refining(images, *args):
+        events.append(("refined", *(i.im_id for i in images)))
+        return refine_batch(images, *args)
+
+    monkeypatch.setattr(module, "image_scenes", making)
+    monkeypatch.setattr(module, "_refine", refining)
+    assert refine(dataset, "--batch", "1", "--config.steps", "1") == 0
+    assert events == [("made", 3), ("refined", 3), ("made", 7), ("refined", 7)]
 
 
 def test_the_pose_form_of_a_plane_gives_the_same_result(dataset):

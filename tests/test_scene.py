@@ -110,6 +110,60 @@ def test_one_body_is_packed_once_however_often_it_stands_there(table, angle, can
     assert scene.instance_entity.tolist() == [0, 0, 1, 2, 2]
 
 
+def test_pairs_are_those_of_all_pairs_tried_in_their_order(table, box, can, angle):
+    """Images of any size in any order, empty ones, static bodies in between, and several planes an image."""
+    generator = torch.Generator().manual_seed(0)
+    for n, bodies, planes, n_images in [(0, 0, 0, 0), (7, 0, 2, 1), (0, 3, 3, 2), (25, 6, 9, 7), (12, 4, 0, 30)]:
+        draw = [torch.randint(max(n_images, 1), (k,), generator=generator) for k in (n, bodies, planes)]
+        same = torch.randint(max(n, 1), (n,), generator=generator)
+        statics = [Static(box, table.at(), int(i)) for i in draw[1]] + [
+            Static(table.plane, image=int(i)) for i in draw[2]
+        ]
+        scene = Scene(([box, can, angle] * n)[:n], statics, image=draw[0], n_images=n_images, same_object=same)
+        image = torch.cat(draw[:2]).tolist()
+        expected = [
+            (i, j)
+            for i in range(n)
+            for j in range(i + 1, n + bodies)
+            if image[i] == image[j] and (j >= n or same[i] != same[j])
+        ]
+        assert sorted(map(tuple, scene.entity_pairs.tolist())) == expected
+        on_planes = [(i, k) for i in range(n) for k in range(planes) if draw[0][i] == draw[2][k]]
+        assert list(map(tuple, scene.plane_pairs.tolist())) == on_planes
+
+
+def test_what_is_made_of_a_scene_shares_its_parts(mixed, table, box, angle):
+    """So whatever is worked out about them once, or copied to a device, holds for hypotheses and selections too."""
+    few, rows = mixed.select(long(2))
+    assert few.parts is mixed.parts is Scene.cat([mixed, few, mixed]).parts
+    alone = Scene([mixed.objects[i] for i in rows.tolist()], gravity=mixed.gravity[2], same_object=long(1, 2))
+    assert few.instance_entity.tolist() == alone.instance_entity.tolist()
+    vertices = [[scene.parts.part(p)[0] for p in scene.instance_part.tolist()] for scene in (few, alone)]
+    assert all(torch.equal(a, b) for a, b in zip(*vertices, strict=True))
+    assert torch.equal(few.object_center, alone.object_center)
+    assert torch.equal(few.object_radius, alone.object_radius)
+    other = Scene.tabletop([angle, box], table.plane)
+    whole = Scene.cat([mixed, other])
+    assert whole.parts.n_bodies == mixed.parts.n_bodies == 3
+    assert torch.equal(whole.instance_start.diff()[[4, 5]], other.instance_start.diff())
+
+
+def test_cat_and_select_take_gravity_and_static_poses_over_bit_by_bit(table, box):
+    """Poses of statics may carry a graph, and dividing a unit vector by its length again could change its last digit."""
+    pose = table.at(0.3, 0, 0.02).requires_grad_()
+    gravity = torch.nn.functional.normalize(
+        torch.rand(40, 3, generator=torch.Generator().manual_seed(1)).double(), dim=1
+    )
+    scenes = [Scene([box], [Static(box, pose)], gravity=g) for g in gravity]
+    whole = Scene.cat(scenes)
+    few, _ = whole.select(torch.arange(39, -1, -2))
+    assert torch.equal(whole.gravity, torch.cat([s.gravity for s in scenes]))
+    assert torch.equal(few.gravity, whole.gravity.flip(0)[::2])
+    assert all(s.T_camera_body is pose for s in (*whole.statics, *few.statics))
+    assert [s.image for s in whole.statics] == list(range(40))
+    assert scenes[3].statics[0].image == 0  # theirs is left alone
+
+
 def test_an_image_without_anything_static_or_several_planes_is_fine(table, box):
     wall = Plane(torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64), torch.tensor(-0.06, dtype=torch.float64))
     scene = Scene(

@@ -224,11 +224,11 @@ def write_estimates(path: str | os.PathLike, estimates: Estimates, poses: Any, *
         if per_image.setdefault(key, seconds) != seconds:
             raise InvalidInputError(f"time differs within scene {key[0]}, image {key[1]}; BOP wants one per image")
     lines = list(estimates.text)
+    R, t = poses[:, :3, :3].flatten(1).tolist(), (poses[:, :3, 3] / _MM).tolist()
     for index, number in enumerate(estimates.line.tolist()):
         fields = lines[number - 1].split(",")
         if changed[index]:
-            fields[4] = " ".join(map(repr, poses[index, :3, :3].flatten().tolist()))
-            fields[5] = " ".join(map(repr, (poses[index, :3, 3] / _MM).tolist()))
+            fields[4], fields[5] = (" ".join(map(repr, numbers)) for numbers in (R[index], t[index]))
         if added[index] != 0 and estimates.time[index] >= 0:
             end = re.search(r"[\r\n]*$", fields[6]).group()
             fields[6] = repr(float(estimates.time[index] + added[index])) + end

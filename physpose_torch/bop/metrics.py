@@ -336,7 +336,8 @@ def _pair_errors(dataset: BopDataset, obj_id: int, pairs: list, poses: torch.Ten
         return np.empty((2, 0))
     T_est, T_gt = _pair_poses(dataset, pairs, poses)
     images = [(scene_id, int(dataset.ground_truth(scene_id).im_id[gt])) for scene_id, _, gt in pairs]
-    K = torch.stack([dataset.camera(*image).K for image in images])
+    cameras = {image: dataset.camera(*image).K for image in set(images)}
+    K = torch.stack([cameras[image] for image in images])
     width = torch.tensor([dataset.image_width(scene_id) for scene_id, _ in images], dtype=torch.float64)
     vertices, symmetries = dataset.vertices(obj_id), dataset.symmetries(obj_id)
     surface = mssd(T_est, T_gt, _hull(vertices), symmetries)
@@ -363,8 +364,9 @@ def _over_symmetries(
     if any(tuple(size) != (4, 4) for size in given.values()) or vertices.shape[1:] != (3,) or not len(vertices):
         sizes = ", ".join(f"{name} {tuple(size)}" for name, size in given.items())
         raise InvalidInputError(f"got {sizes}, vertices {tuple(vertices.shape)}; expected 4×4 transforms and (V, 3)")
-    shape = torch.broadcast_shapes(T_est.shape[:-2], T_gt.shape[:-2])
-    T_est, T_gt = (T.expand(*shape, 4, 4).reshape(-1, 4, 4) for T in (T_est, T_gt))
+    T_est, T_gt = torch.broadcast_tensors(T_est, T_gt)  # torch.broadcast_shapes would import sympy: 0.8 s
+    shape = T_est.shape[:-2]
+    T_est, T_gt = T_est.reshape(-1, 4, 4), T_gt.reshape(-1, 4, 4)
     if K is not None:
         K = K.expand(*shape, 3, 3).reshape(-1, 3, 3)
     count, index = len(T_est), torch.zeros(len(T_est), dtype=torch.long, device=T_est.device)

@@ -1,6 +1,6 @@
 """From a BOP result file to scenes and back: one scene an image, with what could not be used set aside."""
 
-from collections.abc import Container, Mapping
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -93,12 +93,12 @@ def image_scenes(
     *,
     planes: Mapping[tuple[int, int], PlaneRecord] | None = None,
     plane_sigma: float = 0.0,
-    statics: list[StaticRecord] = (),
+    statics: Sequence[StaticRecord] = (),
     counts: Mapping[tuple[int, int, int], int] | None = None,
     broken: Mapping[tuple[int, int], list[str]] | None = None,
     wanted: Container[tuple[int, int]] | None = None,
-) -> list[ImageScene]:
-    """One scene for each image that the estimates name, in file order.
+) -> Iterator[ImageScene]:
+    """One scene for each image that the estimates name, in file order, made when it is asked for.
 
     Args:
         estimates: the result file.
@@ -115,19 +115,16 @@ def image_scenes(
     for row, key in enumerate(zip(estimates.scene_id.tolist(), estimates.im_id.tolist(), strict=True)):
         if wanted is None or key in wanted:
             images.setdefault(key, []).append(row)
-    out = []
     for key, rows in images.items():
         image = ImageScene(*key, np.array(rows), problems=list((broken or {}).get(key, [])))
-        out.append(image)
         if not image.problems and planes is not None and key not in planes:
             image.problems.append(f"{image.name}: no plane in the planes file; add one, or leave out --planes")
-        if image.problems:
-            continue
-        try:
-            image.scene = _scene(image, estimates, library, planes, plane_sigma, statics, counts or {})
-        except PhysPoseError as error:
-            image.problems.append(f"{image.name}: {error}")
-    return out
+        if not image.problems:
+            try:
+                image.scene = _scene(image, estimates, library, planes, plane_sigma, statics, counts or {})
+            except PhysPoseError as error:
+                image.problems.append(f"{image.name}: {error}")
+        yield image
 
 
 def _scene(image, estimates, library, planes, plane_sigma, statics, counts) -> Scene:
@@ -143,15 +140,15 @@ def _scene(image, estimates, library, planes, plane_sigma, statics, counts) -> S
         pose = record.pose(*key)
         if pose is not None:
             standing.append(Static(library.static(record), pose))
-    scene = Scene(objects, standing, gravity=gravity)
-    known = {(0, library.model(i).label): counts[(*key, i)] for i in set(obj_ids) if (*key, i) in counts}
-    same = find_alternatives(
-        estimates.T_camera_object[image.rows], scene, torch.from_numpy(estimates.score[image.rows]), counts=known
-    )
+    known = {
+        (0, body.label): counts[(*key, i)] for i, body in zip(obj_ids, objects, strict=True) if (*key, i) in counts
+    }
+    measured, scores = poses_of([image], estimates)
+    same = find_alternatives(measured, Scene(objects), scores, counts=known)
     return Scene(objects, standing, gravity=gravity, same_object=same)
 
 
-def poses_of(images: list[ImageScene], estimates: Estimates) -> tuple[Tensor, Tensor]:
+def poses_of(images: Sequence[ImageScene], estimates: Estimates) -> tuple[Tensor, Tensor]:
     """Poses (N, 4, 4) [m] and scores (N,) of several images, in the order of their concatenated scene."""
     rows = np.concatenate([i.rows for i in images]) if images else np.zeros(0, dtype=np.int64)
     return estimates.T_camera_object[rows], torch.from_numpy(estimates.score[rows])

@@ -3,8 +3,9 @@
 import json
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
@@ -76,24 +77,27 @@ class Refine:
             raise InvalidInputError(f"--batch {self.batch}, --every {self.every}: expected positive numbers")
         estimates = read_estimates(self.estimates)
         dataset = BopDataset(self.dataset, split=self.split, models=self.models, targets=self.targets)
-        images = self._images(estimates, dataset)
+        total, todo = self._images(estimates, dataset)
         refiner = PhysPoseRefiner(self.config)
         poses = estimates.T_camera_object.clone()
         seconds = np.zeros(len(estimates))
         before, after = _Summary(), _Summary()
-        ready = [i for i in images if i.scene is not None]
-        with progress(len(ready), "refine", "image", quiet=self.quiet) as bar:
-            for start in range(0, len(ready), self.batch):
-                for group in self._run(ready[start : start + self.batch], estimates, refiner):
+        images: list[ImageScene] = []
+        with progress(total, "refine", "image", quiet=self.quiet) as bar:
+            for batch in _batches(todo, self.batch):
+                for group in self._run([i for i in batch if i.scene is not None], estimates, refiner):
                     rows = np.concatenate([i.rows for i in group.images])
                     poses[rows] = group.poses
                     seconds[rows] = group.seconds / len(group.images)
                     before.add(group.before)
                     after.add(group.after)
-                bar.update(len(ready[start : start + self.batch]))
+                for image in batch:
+                    image.scene = None  # its memory is needed for the next ones
+                images += batch
+                bar.update(len(batch))
         write_estimates(self.out, estimates, poses, time=seconds)
         problems = [p for i in images for p in i.problems]
-        refined = [i for i in ready if not i.problems]
+        refined = [i for i in images if not i.problems]
         summary = {
             "images": len(images),
             "refined": len(refined),
@@ -111,7 +115,8 @@ class Refine:
             logger.error(problem)
         return 1 if problems else 0
 
-    def _images(self, estimates: Estimates, dataset: BopDataset) -> list[ImageScene]:
+    def _images(self, estimates: Estimates, dataset: BopDataset) -> tuple[int, Iterator[ImageScene]]:
+        """How many images there are to refine or to complain about, and these, in file order, made one by one."""
         broken: dict[tuple[int, int], list[str]] = {}
         unplaced = []
         planes = None
@@ -128,9 +133,15 @@ class Refine:
         if dataset.targets_path is not None:  # never from the ground truth
             counts = {(t.scene_id, t.im_id, t.obj_id): t.inst_count for t in dataset.targets}
         statics = read_statics(self.statics) if self.statics is not None else []
-        keys = dict.fromkeys(zip(estimates.scene_id.tolist(), estimates.im_id.tolist(), strict=True))
-        keys = [k for k in {**keys, **broken} if not self.scenes or k[0] in self.scenes]
-        wanted = set(keys[:: self.every])
+        readable = dict.fromkeys(zip(estimates.scene_id.tolist(), estimates.im_id.tolist(), strict=True))
+        keys = [k for k in {**readable, **broken} if not self.scenes or k[0] in self.scenes][:: self.every]
+        # none of these images' rows could be read; a bad plane of an image without rows harms nobody
+        bad_rows = {(p.scene_id, p.im_id) for p in estimates.problems}
+        lost = [k for k in keys if k in bad_rows and k not in readable]
+        nothing = np.zeros(0, dtype=np.int64)
+        rest = [ImageScene(*key, nothing, problems=broken[key]) for key in lost]
+        if unplaced:
+            rest.append(ImageScene(-1, -1, nothing, problems=unplaced))
         images = image_scenes(
             estimates,
             BodyLibrary(dataset),
@@ -139,22 +150,14 @@ class Refine:
             statics=statics,
             counts=counts,
             broken=broken,
-            wanted=wanted,
+            wanted=set(keys),
         )
-        rows_read = {(i.scene_id, i.im_id) for i in images}
-        nothing = np.zeros(0, dtype=np.int64)
-        bad_rows = {(p.scene_id, p.im_id) for p in estimates.problems}
-        for key in wanted - rows_read:
-            if (
-                key in bad_rows
-            ):  # none of the image's rows could be read; a bad plane of an image without rows harms nobody
-                images.append(ImageScene(*key, nothing, problems=broken[key]))
-        if unplaced:
-            images.append(ImageScene(-1, -1, nothing, problems=unplaced))
-        return images
+        return sum(k in readable for k in keys) + len(rest), chain(images, rest)
 
     def _run(self, images: Sequence[ImageScene], estimates: Estimates, refiner: PhysPoseRefiner) -> "list[_Group]":
         """Refine images as one batch; if that fails, one by one, so that only the culprit is left out."""
+        if not images:
+            return []
         try:
             return [_refine(images, estimates, refiner)]
         except PhysPoseError as error:
@@ -162,6 +165,19 @@ class Refine:
                 images[0].problems.append(f"{images[0].name}: {error}")
                 return []
             return [g for i in images for g in self._run([i], estimates, refiner)]
+
+
+def _batches(images: Iterable[ImageScene], size: int) -> Iterator[list[ImageScene]]:
+    """The images in order, ``size`` of those with a scene at a time; the others come along."""
+    batch, ready = [], 0
+    for image in images:
+        batch.append(image)
+        ready += image.scene is not None
+        if ready == size:
+            yield batch
+            batch, ready = [], 0
+    if batch:
+        yield batch
 
 
 @dataclass

@@ -1,5 +1,6 @@
 """Signed and drop distances of part pairs, differentiable with respect to both poses, over any backend."""
 
+import importlib.util
 from collections.abc import Callable
 
 import torch
@@ -12,7 +13,7 @@ from physpose_torch.distance.support import DistanceResult
 from physpose_torch.errors import InvalidInputError, MissingExtraError
 from physpose_torch.geometry.convex import ConvexParts
 
-__all__ = ["backends", "drop_distance", "signed_distance"]
+__all__ = ["backends", "chosen_backend", "drop_distance", "signed_distance"]
 
 Backend = Callable[[ConvexParts, Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]
 
@@ -25,11 +26,7 @@ GRAZING = 1e-3
 
 def backends() -> list[str]:
     """Names of the distance backends that this installation can run, best first."""
-    try:
-        import fcl  # noqa: F401
-    except ImportError:
-        return []
-    return ["fcl"]
+    return [name for name, module in (("warp", "warp"), ("fcl", "fcl")) if importlib.util.find_spec(module)]
 
 
 def signed_distance(
@@ -64,6 +61,10 @@ def signed_distance(
             "expected (E, 4, 4), (E, 4, 4) and (E, 2)"
         )
     with torch.autocast(T_a.device.type, enabled=False):  # a micrometre is lost in half precision
+        if chosen_backend(backend) == "warp" and _fused(smoothing):
+            from physpose_torch.distance.warp import warp_distance
+
+            return warp_distance(T_a, T_b, parts, pairs, smoothing)
         return DistanceResult(*_SignedDistance.apply(T_a, T_b, parts, pairs, _backend(backend), smoothing))
 
 
@@ -93,6 +94,11 @@ def drop_distance(
         distance: (E,) [m], 0 where they already touch or overlap, infinite where they never meet; normal and witness
         points are those at the meeting point, a's before the fall.
     """
+    if chosen_backend(backend) == "warp" and _fused(smoothing):
+        from physpose_torch.distance.warp import warp_drop
+
+        with torch.autocast(T_a.device.type, enabled=False):
+            return warp_drop(T_a, T_b, parts, pairs, gravity, limit, smoothing)
     with torch.no_grad():
         run = _backend(backend)
         fall = T_a.new_zeros(len(pairs))
@@ -151,17 +157,36 @@ class _SignedDistance(torch.autograd.Function):
         return weight * gradient_a, weight * gradient_b, None, None, None, None
 
 
-def _backend(name: str) -> Backend:
+def chosen_backend(name: str) -> str:
+    """The backend that ``auto`` or a name stands for.
+
+    Raises:
+        InvalidInputError: the backend is unknown.
+        MissingExtraError: no distance backend is installed.
+    """
     installed = backends()
     if name == "auto":
         if not installed:
-            raise MissingExtraError("no distance backend is installed; pip install python-fcl")
-        name = installed[0]
+            raise MissingExtraError("no distance backend is installed; pip install warp-lang or python-fcl")
+        return installed[0]
     if name not in installed:
         raise InvalidInputError(f"distance backend {name!r} is not available; installed here: {', '.join(installed)}")
-    from physpose_torch.distance.fcl import fcl_distance
+    return name
 
-    return {"fcl": fcl_distance}[name]
+
+def _fused(smoothing: Smoothing | None) -> bool:
+    """Whether the Warp kernel smooths this way itself."""
+    return smoothing is None or smoothing.kind in ("ring", "gaussian", "none")
+
+
+def _backend(name: str) -> Backend:
+    if chosen_backend(name) == "fcl":
+        from physpose_torch.distance.fcl import fcl_distance
+
+        return fcl_distance
+    from physpose_torch.distance.warp import warp_query
+
+    return warp_query
 
 
 def _query(run: Backend, T_a: Tensor, T_b: Tensor, parts: ConvexParts, pairs: Tensor) -> tuple[Tensor, ...]:

@@ -24,10 +24,12 @@ from torch import Tensor
 
 from physpose_torch.config import Smoothing
 
-__all__ = ["smoothed_points", "vertex_weights"]
+__all__ = ["smoothed_points", "smoothing_nodes", "tangent_basis", "vertex_weights"]
 
 NEWTON_STEPS = 30
 RING_RADII = 6
+RING_SHARE = 1e-3
+"""The outer rings, which together weigh less than this, are left out."""
 GOLDEN = 0.6180339887498949
 CONTACT_BLUR = 1e-5
 """[m]; spread that every contact point has at least, so that two vertices meet half-way."""
@@ -50,15 +52,10 @@ def vertex_weights(vertices: Tensor, mask: Tensor, normal: Tensor, smoothing: Sm
     if smoothing.kind == "gumbel":
         height = torch.einsum("eki,ei->ek", vertices, normal)
         return torch.softmax((height / smoothing.temperature).masked_fill(~mask, -torch.inf), dim=1)
-    if smoothing.kind == "gaussian":
-        generator = torch.Generator().manual_seed(smoothing.seed)
-        half = torch.randn((smoothing.samples + 1) // 2, 3, generator=generator, dtype=torch.float64).to(normal)
-        draws = torch.cat([half, -half])
-        directions = normal[:, None] + smoothing.noise * draws
-        share = normal.new_full((len(draws),), 1.0 / len(draws))
-    else:
-        ring, share = (x.to(normal) for x in _rings(smoothing.samples))
-        directions = normal[:, None] + smoothing.noise * (ring @ tangent_basis(normal))
+    nodes, share = (x.to(normal) for x in smoothing_nodes(smoothing))
+    if smoothing.kind != "gaussian":
+        nodes = nodes[:, :2] @ tangent_basis(normal)
+    directions = normal[:, None] + smoothing.noise * nodes
     farthest = (directions @ vertices.mT).argmax(2)
     farthest = torch.where(mask.gather(1, farthest), farthest, 0)  # padding repeats the first vertex
     return torch.zeros_like(mask, dtype=normal.dtype).scatter_add(1, farthest, share.expand(len(normal), -1))
@@ -121,17 +118,28 @@ def tangent_basis(normal: Tensor) -> Tensor:
     return torch.stack([u, v], dim=-2)
 
 
+def smoothing_nodes(smoothing: Smoothing) -> tuple[Tensor, Tensor]:
+    """Nodes (M, 3) and weights (M,): draws in space for ``gaussian``, else rings across the normal, third entries 0."""
+    if smoothing.kind != "gaussian":
+        return _rings(smoothing.samples)
+    generator = torch.Generator().manual_seed(smoothing.seed)
+    half = torch.randn((smoothing.samples + 1) // 2, 3, generator=generator, dtype=torch.float64)
+    return torch.cat([half, -half]), torch.full((2 * len(half),), 0.5 / len(half), dtype=torch.float64)
+
+
 @functools.cache
 def _rings(samples: int) -> tuple[Tensor, Tensor]:
-    """Nodes (M, 2) and weights (M,) of a standard normal in the plane.
+    """Nodes (M, 3), third entries 0, and weights (M,) of a standard normal in the plane.
 
     Trapezoid rule round the angle, and Gauss-Laguerre for ½|z|², which is exponentially distributed. The rings are
     turned against each other, so that the straight borders between vertices do not meet the nodes of all rings at once.
     """
     half_square, weight = np.polynomial.laguerre.laggauss(RING_RADII)
-    angle = 2 * np.pi * (np.arange(samples) + 0.5 + GOLDEN * np.arange(RING_RADII)[:, None]) / samples
+    kept = np.flip(np.cumsum(np.flip(weight))) > RING_SHARE
+    half_square, weight = half_square[kept], weight[kept] / weight[kept].sum()
+    angle = 2 * np.pi * (np.arange(samples) + 0.5 + GOLDEN * np.arange(len(weight))[:, None]) / samples
     radius = np.sqrt(2 * half_square)[:, None]
-    nodes = np.stack([(radius * f(angle)).ravel() for f in (np.cos, np.sin)], axis=1)
+    nodes = np.stack([(radius * f(angle)).ravel() for f in (np.cos, np.sin, np.zeros_like)], axis=1)
     return torch.from_numpy(nodes), torch.from_numpy(np.repeat(weight / samples, samples))
 
 

@@ -96,7 +96,7 @@ class Body:
         """(3,) greatest coordinates of the mesh [m]."""
         return torch.tensor(self.mesh.bounds[1], dtype=torch.float64)
 
-    @property
+    @cached_property
     def center(self) -> Tensor:
         """(3,) centre of the bounds; viewing rays go there [m]."""
         return 0.5 * (self.lower + self.upper)

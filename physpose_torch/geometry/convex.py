@@ -1,8 +1,11 @@
 """Convex parts of many bodies, packed into flat tensors that every distance backend reads in place."""
 
+import itertools
+import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,10 +17,29 @@ from torch import Tensor
 
 from physpose_torch.errors import InvalidInputError
 
-__all__ = ["ConvexParts"]
+__all__ = ["ConvexParts", "Facets"]
 
 COPLANAR = 1e-10
 """Triangles whose unit normals differ by less than this are one face; on a body of 1 m that is less than 0.1 nm."""
+
+
+_sets: "weakref.WeakValueDictionary[int, ConvexParts]" = weakref.WeakValueDictionary()
+
+
+class Facets(NamedTuple):
+    """Faces and edges of all parts, packed one part after another; coplanar triangles are one face."""
+
+    normals: Tensor
+    """(G, 3) outward unit normals."""
+    offsets: Tensor
+    """(G,): face g lies in the plane ``normals[g] · x = offsets[g]`` [m]."""
+    start: Tensor
+    """(P + 1,) long: part p has the faces ``start[p]:start[p + 1]``."""
+    edges: Tensor
+    """(L, 4) long: the two vertices of each edge between different faces and the two faces that meet there (its arc on the
+    Gauss sphere), numbered within the part."""
+    edge_start: Tensor
+    """(P + 1,) long."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +61,16 @@ class ConvexParts:
     """(P + 1,) long."""
     part_start: Tensor
     """(B + 1,) long."""
+    handle: int = field(init=False, repr=False, default_factory=itertools.count().__next__)
+    """Number of this set in this process; operators, which take no objects, find it by :meth:`by_handle`."""
+
+    def __post_init__(self) -> None:
+        _sets[self.handle] = self
+
+    @staticmethod
+    def by_handle(handle: int) -> "ConvexParts":
+        """The living set with this :attr:`handle`."""
+        return _sets[handle]
 
     @classmethod
     def from_hulls(cls, hulls: Sequence[np.ndarray], *, dtype: torch.dtype = torch.float64) -> "ConvexParts":
@@ -64,20 +96,25 @@ class ConvexParts:
         if len(parts) == 0:
             start, empty = torch.zeros(1, dtype=torch.long), torch.zeros(0, 3, dtype=torch.float64)
             return cls(empty, start, empty.long(), start, start)
-        return cls(
+        out = cls(
             vertices=torch.cat([p.vertices for p in parts]),
             vertex_start=_cat_starts([p.vertex_start for p in parts]),
             faces=torch.cat([p.faces for p in parts]),
             face_start=_cat_starts([p.face_start for p in parts]),
             part_start=_cat_starts([p.part_start for p in parts]),
         )
+        if all(p.dtype == out.dtype and p.device == out.device for p in parts):
+            object.__setattr__(out, "_members", tuple(parts))  # what they have worked out already is not done again
+        return out
 
     def to(self, *args, **kwargs) -> "ConvexParts":
         """The same parts on another device or in another dtype (coordinates only)."""
         vertices = self.vertices.to(*args, **kwargs)
         if vertices is self.vertices:
             return self
-        rest = {f.name: getattr(self, f.name).to(vertices.device) for f in fields(self) if f.name != "vertices"}
+        rest = {
+            f.name: getattr(self, f.name).to(vertices.device) for f in fields(self) if f.init and f.name != "vertices"
+        }
         return ConvexParts(vertices=vertices, **rest)
 
     @cached_property
@@ -111,9 +148,7 @@ class ConvexParts:
         """(P, K, 3) vertices, the first one repeated up to the largest count K: a maximum needs no mask."""
         if self.n_parts == 0:
             return self.vertices.new_zeros(0, 1, 3)
-        k = torch.arange(int(self.vertex_count.max()), device=self.device)
-        index = self.vertex_start[:-1, None] + torch.where(k < self.vertex_count[:, None], k, 0)
-        return self.vertices[index]
+        return self.vertices[_padding(self.vertex_start)[0]]
 
     @cached_property
     def padded_mask(self) -> Tensor:
@@ -141,40 +176,59 @@ class ConvexParts:
         return torch.linalg.vector_norm(self.padded - self.center[:, None], dim=-1).amax(1)
 
     @cached_property
-    def _facets(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def facets(self) -> Facets:
+        """Faces and edges of all parts."""
+        members = self.__dict__.get("_members", ())
+        if members:
+            columns = list(zip(*(p.facets for p in members), strict=True))
+            starts = (_cat_starts(columns[i]) for i in (2, 4))
+            normals, offsets, edges = (torch.cat(columns[i]) for i in (0, 1, 3))
+            start, edge_start = starts
+            return Facets(normals, offsets, start, edges, edge_start)
         rows = [_faces_and_edges(*(x.cpu().numpy() for x in self.part(p))) for p in range(self.n_parts)]
-        columns = zip(*rows, strict=True) if rows else ((),) * 3
-        normals, edges, sides = ([torch.as_tensor(x) for x in column] for column in columns)
-        n_faces, n_edges = (max((len(x) for x in column), default=1) for column in (normals, edges))
-        normal = self.vertices.new_zeros(self.n_parts, n_faces, 3)
-        edge = torch.zeros(self.n_parts, n_edges, 2, dtype=torch.long, device=self.device)
-        side = torch.zeros_like(edge)
-        for p in range(self.n_parts):
-            normal[p] = normals[p][:1].to(normal)
-            normal[p, : len(normals[p])] = normals[p].to(normal)
-            edge[p, : len(edges[p])], side[p, : len(sides[p])] = edges[p].to(edge), sides[p].to(edge)
-        offset = (normal @ self.padded.mT).amax(2)
-        return normal, offset, edge, side
+        normals, edges = (
+            (np.concatenate(column) for column in zip(*rows, strict=True))
+            if rows
+            else (np.zeros((0, 3)), np.zeros((0, 4), dtype=np.int64))
+        )
+        start, edge_start = (_starts([len(row[i]) for row in rows]).to(self.device) for i in range(2))
+        normals, edges = torch.as_tensor(normals).to(self.vertices), torch.as_tensor(edges).to(self.device)
+        part = torch.repeat_interleave(torch.arange(self.n_parts, device=self.device), start.diff())
+        offsets = (self.padded[part] @ normals[:, :, None])[:, :, 0].amax(1) if len(normals) else normals[:, 0]
+        return Facets(normals, offsets, start, edges, edge_start)
+
+    @cached_property
+    def _padded_facets(self) -> tuple[Tensor, Tensor, Tensor]:
+        f = self.facets
+        face, _ = _padding(f.start)
+        edge, is_edge = _padding(f.edge_start)
+        if self.n_parts == 0:
+            empty = self.vertices.new_zeros(0, 1)
+            return empty[:, :, None].expand(0, 1, 3), empty, empty[:, :, None].expand(0, 1, 4).long()
+        edges = (
+            torch.where(is_edge[:, :, None], f.edges[edge], 0) if len(f.edges) else f.edges.new_zeros(*edge.shape, 4)
+        )
+        return f.normals[face], f.offsets[face], edges
 
     @property
     def face_normals(self) -> Tensor:
         """(P, F, 3) outward unit normals of the faces, coplanar triangles merged, padded by repetition."""
-        return self._facets[0]
+        return self._padded_facets[0]
 
     @property
     def face_offsets(self) -> Tensor:
         """(P, F): face f lies in the plane ``face_normals[p, f] · x = face_offsets[p, f]`` [m]."""
-        return self._facets[1]
+        return self._padded_facets[1]
 
     @property
     def edge_vertices(self) -> Tensor:
         """(P, L, 2) long: the two vertices of each edge between different faces, padded by zeros."""
-        return self._facets[2]
+        return self._padded_facets[2][:, :, :2]
 
     @property
     def edge_faces(self) -> Tensor:
         """(P, L, 2) long: the two faces that meet in each edge (its arc on the Gauss sphere), padded by zeros."""
-        return self._facets[3]
+        return self._padded_facets[2][:, :, 2:]
 
     def part(self, p: int) -> tuple[Tensor, Tensor]:
         """Vertices (V_p, 3) and triangles (F_p, 3) of one part."""
@@ -218,12 +272,21 @@ def _cat_starts(starts: Sequence[Tensor]) -> Tensor:
     return torch.cat([counts.new_zeros(1), counts.cumsum(0)])
 
 
-def _faces_and_edges(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Face normals (F, 3), and of each edge (L, 2) its vertices and its two faces; coplanar triangles are one face."""
+def _padding(start: Tensor) -> tuple[Tensor, Tensor]:
+    """Indices (P, K) of packed rows, each part's first one repeated up to the largest count K ≥ 1, and which are real."""
+    count = start.diff()
+    k = torch.arange(max(int(count.max()), 1) if len(count) else 1, device=start.device)
+    real = k < count[:, None]
+    return start[:-1, None] + torch.where(real, k, 0), real
+
+
+def _faces_and_edges(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Face normals (F, 3), and of each edge (L, 4) its vertices and its two faces; coplanar triangles are one face."""
     a, b, c = (vertices[triangles[:, i]] for i in range(3))
     normal = np.cross(b - a, c - a)
     area = np.linalg.norm(normal, axis=1)
-    normal /= np.maximum(area, 1e-300)[:, None]
+    normal[area == 0] = 0.0, 0.0, 1.0  # no triangle at all; any direction will do
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     ends = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
     order = np.lexsort(ends.T)  # the two triangles of an edge become neighbours
     ends, sides = ends[order[::2]], (order % len(triangles)).reshape(-1, 2)
@@ -236,4 +299,4 @@ def _faces_and_edges(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.nd
     by_area = np.argsort(area, kind="stable")
     largest[face[by_area]] = by_area
     edge = face[sides[:, 0]] != face[sides[:, 1]]
-    return normal[largest], ends[edge], face[sides[edge]]
+    return normal[largest], np.concatenate([ends[edge], face[sides[edge]]], axis=1)

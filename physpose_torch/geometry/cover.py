@@ -13,12 +13,23 @@ __all__ = ["MIN_THICKNESS", "Surface", "clean_mesh", "hull_of", "measure_cover",
 MIN_THICKNESS = 2e-4  # [m] a part flatter than this is extruded to it, so that every hull has a volume
 
 
+def _unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distinct rows of integers in ascending order, the first place of each, and which one each row is.
+
+    ``np.unique(axis=0)`` gives the same, ten times slower.
+    """
+    order = np.lexsort(rows.T[::-1])
+    new = np.ones(len(rows), dtype=bool)
+    new[1:] = (rows[order[1:]] != rows[order[:-1]]).any(1)
+    inverse = np.empty(len(rows), dtype=np.int64)
+    inverse[order] = np.cumsum(new) - 1
+    return rows[order[new]], order[new], inverse
+
+
 def _without_flaps(faces: np.ndarray) -> np.ndarray:
     """Drop triangles with a free edge that hang on an edge of two others, if that closes the mesh (scans have some)."""
-    _, edge, count = np.unique(
-        np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    edge = edge.reshape(-1, 3)
+    edge = _unique_rows(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1))[2].reshape(-1, 3)
+    count = np.bincount(edge.ravel())
     flap = (count[edge] == 1).any(1) & (count[edge] > 2).any(1)
     left = np.unique(edge[~flap], return_counts=True)[1]
     return faces[~flap] if flap.any() and (left == 2).all() else faces
@@ -38,11 +49,11 @@ def clean_mesh(mesh: trimesh.Trimesh, name: str) -> trimesh.Trimesh:
             f"{name} is {size:.4g} m large, expected 0.001 to 10: vertices are in metres; pass scale=0.001 "
             "(or mesh.apply_scale(0.001)) for a mesh in millimetres"
         )
-    grid, index = np.unique(np.round(corners * 1e9).astype(np.int64), axis=0, return_inverse=True)
+    grid, _, index = _unique_rows(np.round(corners * 1e9).astype(np.int64))
     faces = index.reshape(-1, 3)
     faces = np.take_along_axis(faces, (faces.argmin(1)[:, None] + np.arange(3)) % 3, axis=1)
     faces = faces[np.lexsort(faces.T[::-1])]
-    distinct, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    distinct, first, _ = _unique_rows(np.sort(faces, axis=1))
     faces = faces[np.sort(first[(np.diff(distinct) > 0).all(1)])]
     clean = trimesh.Trimesh(grid * 1e-9, _without_flaps(faces), process=False)
     clean.remove_unreferenced_vertices()

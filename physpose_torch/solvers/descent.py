@@ -2,22 +2,24 @@
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
-from physpose_torch import se3
 from physpose_torch.config import RefinerConfig
 from physpose_torch.contacts import object_heights
-from physpose_torch.losses import PhysicsTerms, physics_terms, prior_loss
+from physpose_torch.distance.autograd import chosen_backend
+from physpose_torch.losses import PhysicsTerms
 from physpose_torch.prior import PosePrior
 from physpose_torch.scene import Scene
+from physpose_torch.solvers.general import GeneralCost
 
-__all__ = ["Descent", "descend"]
+if TYPE_CHECKING:
+    from physpose_torch.fused import FusedCost
 
-STILL_STEPS = 10
-"""An image stops after this many steps on end without motion; finished images leave the batch at these intervals."""
+__all__ = ["Descent", "descend", "make_cost", "out_of_planes"]
+
 ADAM_BETAS = (0.8, 0.95)
 """Short memories: contacts come and go within a few steps."""
 LEAST_SLOPE = 0.2
@@ -57,67 +59,73 @@ def descend(
         config: optimizer options.
         callback: called with step, poses (N, 4, 4) and terms of the images still running before each step.
     """
-    n, n_images = len(scene), scene.n_images
     poses = out_of_planes(prior, scene) if config.start == "slide" else prior.measured.clone()
-    radius = scene.object_radius.to(poses)
-    scale = _principal_scale(prior) if config.optimizer == "adam" else torch.eye(6).to(poses).expand(n, 6, 6)
-    x = torch.zeros(n, 6, dtype=poses.dtype, device=poses.device, requires_grad=True)
+    scale = _principal_scale(prior) if config.optimizer == "adam" else torch.eye(6).to(poses).expand(len(scene), 6, 6)
+    cost = make_cost(prior, scene, acts, config, poses, scale)
+    x = cost.step.requires_grad_()
     if config.optimizer == "adam":
-        optimizer = torch.optim.Adam([x], lr=config.learning_rate, betas=ADAM_BETAS, eps=ADAM_EPS)
+        optimizer = torch.optim.Adam([x], lr=config.learning_rate, betas=ADAM_BETAS, eps=ADAM_EPS, fused=True)
     else:
-        optimizer = torch.optim.SGD([x], lr=config.learning_rate)
+        optimizer = torch.optim.SGD([x], lr=config.learning_rate, fused=True)
     schedule = None
     if config.decay == "cosine" and config.steps:
         schedule = torch.optim.lr_scheduler.LambdaLR(
             optimizer, lambda k: 0.5 * (1 + math.cos(math.pi * k / config.steps))
         )
-
-    still = torch.zeros(n_images, dtype=torch.long)
-    steps = torch.full((n_images,), config.steps)
-    done = torch.bincount(scene.image, minlength=n_images) == 0  # nothing in an empty image: nothing to do
-    steps[done] = 0
-    active, rows, active_prior = _select(scene, prior, ~done)
     trajectory = [prior.measured.clone()] if config.keep_trajectory else None
+    watch = _Watch(cost)
     for step in range(config.steps):
-        if bool(done.all()):
+        cost.evaluate(step)
+        if watch.all_done():
             break
-        leaf = poses[rows].requires_grad_()
-        pose = prior_loss(leaf, active_prior)
-        collision, share, gravity = physics_terms(leaf, active, acts[rows], config.physics)
-        weights = config.physics
-        total = weights.pose_weight * pose + weights.collision_weight * share + weights.gravity_weight * gravity
-        (gradient,) = torch.autograd.grad(total.sum(), leaf)
         if callback is not None:
-            callback(
-                step, leaf.detach(), PhysicsTerms(pose.detach(), collision.detach(), gravity.detach(), total.detach())
-            )
-
-        tangent = se3.tangent_gradient(leaf.detach(), gradient)
-        tangent = (scale[rows].mT @ tangent[:, :, None])[:, :, 0]
-        if config.max_gradient is not None:
-            length = torch.linalg.vector_norm(tangent, dim=1, keepdim=True)
-            tangent = tangent * (config.max_gradient / length.clamp_min(config.max_gradient))
-        x.grad = torch.zeros_like(x).index_copy(0, rows, tangent)
-        with torch.no_grad():
-            x.zero_()
+            rows = (~cost.done[scene.image.to(cost.done.device)]).nonzero()[:, 0].to(poses.device)
+            callback(step, cost.poses[rows], cost.terms(rows))
+        x.grad = cost.gradient
         optimizer.step()
         if schedule is not None:
             schedule.step()
-        move = (scale[rows] @ x.detach()[rows, :, None])[:, :, 0]
-        reach = move[:, :3].norm(dim=1) + move[:, 3:].norm(dim=1) * radius[rows]
-        shorten = (config.max_step / reach.clamp_min(config.max_step))[:, None]
-        poses = poses.index_copy(0, rows, se3.retract(leaf.detach(), move * shorten))
+        cost.move()
         if trajectory is not None:
-            trajectory.append(poses.clone())
+            trajectory.append(cost.poses.clone())
+    else:
+        cost.evaluate(config.steps)  # who came to rest in the last step
+    done = cost.done.cpu()
+    steps = torch.where(done, cost.steps.cpu(), config.steps)
+    return Descent(cost.poses.clone(), steps, done, torch.stack(trajectory) if trajectory is not None else None)
 
-        farthest = torch.zeros(n_images, dtype=poses.dtype).scatter_reduce(0, scene.image[rows], reach.cpu(), "amax")
-        still = torch.where(farthest <= config.tolerance, still + 1, 0)
-        finished = ~done & (still >= STILL_STEPS)
-        steps[finished] = step + 1
-        if bool(finished.any()):
-            done = done | finished
-            active, rows, active_prior = _select(scene, prior, ~done)
-    return Descent(poses, steps, done, torch.stack(trajectory) if trajectory is not None else None)
+
+def make_cost(
+    prior: PosePrior, scene: Scene, acts: Tensor, config: RefinerConfig, poses: Tensor, scale: Tensor
+) -> "GeneralCost | FusedCost":
+    """The cost at hand: compiled kernels where they know it, else autograd."""
+    if chosen_backend(config.physics.backend) == "warp":
+        from physpose_torch.fused import FusedCost
+
+        if FusedCost.fits(config):
+            return FusedCost(prior, scene, acts, config, poses, scale)
+    return GeneralCost(prior, scene, acts, config, poses, scale)
+
+
+class _Watch:
+    """Tells when all images are done, without making the host wait for a CUDA device."""
+
+    def __init__(self, cost: "GeneralCost | FusedCost") -> None:
+        self._cost = cost
+        self._asked: tuple[Tensor, torch.cuda.Event] | None = None
+
+    def all_done(self) -> bool:
+        if self._cost.poses.device.type != "cuda":
+            return bool(self._cost.done.all())
+        if self._asked is None:
+            answer = torch.empty((), dtype=torch.bool, pin_memory=True)
+            answer.copy_(self._cost.done.all(), non_blocking=True)
+            self._asked = answer, torch.cuda.Event()
+            self._asked[1].record()
+        elif self._asked[1].query():
+            answer, self._asked = bool(self._asked[0]), None
+            return answer
+        return False
 
 
 def out_of_planes(prior: PosePrior, scene: Scene) -> Tensor:
@@ -138,14 +146,6 @@ def out_of_planes(prior: PosePrior, scene: Scene) -> Tensor:
     slide = torch.where(slide < 0.9 * range_, slide, 0.0)  # never behind the camera
     poses[:, :3, 3] -= (slide / range_)[:, None] * prior.ray
     return poses
-
-
-def _select(scene: Scene, prior: PosePrior, running: Tensor) -> tuple[Scene, Tensor, PosePrior]:
-    """Scene, rows and prior of the images that are still running."""
-    active, rows = scene.select(running.nonzero()[:, 0])
-    image = active.image.to(prior.image.device)
-    selected = (x[rows.to(x.device)] for x in prior[:4])
-    return active, rows, PosePrior(*selected, image, active.n_images, *prior[6:])
 
 
 def _principal_scale(prior: PosePrior) -> Tensor:

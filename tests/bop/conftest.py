@@ -39,4 +39,3 @@ def write_csv(tmp_path):
         return path
 
     return write
-

@@ -1,0 +1,281 @@
+"""Signed and drop distances by NVIDIA Warp: one thread a part pair, CPU and CUDA, float32 and float64 from one source.
+
+The kernels (``physpose_torch/distance/kernels``) are compiled on first use, which takes some seconds, and cached by Warp.
+``torch.compile`` sees two opaque operators, ``physpose_torch::signed_distance`` and ``physpose_torch::drop_distance``.
+"""
+
+import contextlib
+import functools
+import logging
+import os
+import time
+import weakref
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from physpose_torch import se3
+from physpose_torch.config import Smoothing
+from physpose_torch.distance.kernels.pair import pairs as pair_kernels
+from physpose_torch.distance.kernels.shapes import LANES, shapes
+from physpose_torch.distance.kernels.smooth import smooth
+from physpose_torch.distance.smoothing import CONTACT_BLUR, smoothing_nodes
+from physpose_torch.distance.support import DistanceResult
+from physpose_torch.errors import BackendError
+from physpose_torch.geometry.convex import ConvexParts
+
+__all__ = [
+    "fill",
+    "launch",
+    "load",
+    "parts_struct",
+    "ready",
+    "warp_distance",
+    "warp_drop",
+    "warp_query",
+    "wobble_struct",
+    "wrap",
+]
+
+logger = logging.getLogger("physpose_torch")
+
+REAL = {torch.float32: wp.float32, torch.float64: wp.float64}
+_structs: "weakref.WeakKeyDictionary[ConvexParts, dict]" = weakref.WeakKeyDictionary()
+
+
+@functools.cache
+def _initialised() -> None:
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # no banner, no load times
+    with contextlib.nullcontext() if torch.cuda.is_available() else _silent():
+        wp.init()
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """No standard error, not even of C code: Warp warns of a missing CUDA driver, which is no news on a CPU."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # there is none
+        yield
+        return
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+            yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
+@functools.cache
+def ready(dtype: torch.dtype, device: torch.device) -> SimpleNamespace:
+    """Kernels for a dtype, compiled for a device."""
+    _initialised()
+    kernels = pair_kernels(REAL[dtype])
+    load(kernels.module, device)
+    return kernels
+
+
+def load(module: "wp.Module", device: torch.device) -> None:
+    """Compile a module, or load it from Warp's cache, and say so if that takes long."""
+    start = time.perf_counter()
+    logger.info("loading distance kernels; compiling them, once, takes up to 20 s")
+    if module.load(wp.device_from_torch(device)) is None:
+        raise BackendError(f"Warp could not compile the distance kernels for {device}; use another backend ('fcl')")
+    logger.info("distance kernels loaded in %.1f s", time.perf_counter() - start)
+
+
+def wrap(tensor: Tensor, dtype: Any = None) -> "wp.array":
+    """A tensor as a Warp array in place; it must outlive the array."""
+    if tensor.numel() == 0:  # the strides of empty tensors are anything
+        tensor = torch.zeros(tensor.shape, dtype=tensor.dtype, device=tensor.device)
+    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+
+
+def parts_struct(parts: ConvexParts, dtype: torch.dtype, device: torch.device) -> Any:
+    """The parts as the kernels read them, made once for each set, dtype and device."""
+    structs = _structs.setdefault(parts, {})
+    if (dtype, device) not in structs:
+        s = shapes(REAL[dtype])
+        facets, half = parts.facets, 0.5 * (parts.upper - parts.lower)
+        lanes, lane_start = _lanes(parts)
+        fields = {
+            "vertices": (parts.vertices, s.vec3),
+            "vertex_start": (parts.vertex_start, None),
+            "lanes": (lanes, None),
+            "lane_start": (lane_start, None),
+            "normals": (facets.normals, s.vec3),
+            "offsets": (facets.offsets, None),
+            "normal_start": (facets.start, None),
+            "edges": (facets.edges, wp.vec4i),
+            "edge_start": (facets.edge_start, None),
+            "center": (parts.center, s.vec3),
+            "half": (half, s.vec3),
+        }
+        structs[dtype, device] = fill(s.Parts(), fields, dtype, device)
+    return structs[dtype, device]
+
+
+def fill(struct: Any, fields: dict[str, tuple[Tensor, Any]], dtype: torch.dtype, device: torch.device) -> Any:
+    """Set the arrays of a kernel's struct: real ones in ``dtype``, whole numbers in int32. The struct keeps them alive."""
+    keep = {}
+    for name, (tensor, kind) in fields.items():
+        keep[name] = tensor.detach().to(device, dtype if tensor.is_floating_point() else torch.int32).contiguous()
+        setattr(struct, name, wrap(keep[name], kind))
+    struct.__dict__["_tensors"] = keep
+    return struct
+
+
+def _lanes(parts: ConvexParts) -> tuple[Tensor, Tensor]:
+    """The vertices in blocks of ``LANES``, coordinate by coordinate, and each part's first block."""
+    count = parts.vertex_count
+    blocks = (count + LANES - 1) // LANES
+    start = torch.cat([blocks.new_zeros(1), blocks.cumsum(0)])
+    part = torch.repeat_interleave(torch.arange(parts.n_parts, device=count.device), blocks)
+    within = (torch.arange(len(part), device=count.device) - start[part])[:, None] * LANES
+    within = within + torch.arange(LANES, device=count.device)
+    index = parts.vertex_start[part, None] + torch.where(within < count[part, None], within, 0)
+    return parts.vertices[index].mT.reshape(-1), start
+
+
+@functools.cache
+def wobble_struct(smoothing: Smoothing | None, dtype: torch.dtype, device: torch.device) -> Any:
+    """Quadrature of the smoothing as the kernels read it; None: no nodes, no smoothing."""
+    nodes, share = torch.zeros(0, 3, dtype=dtype), torch.zeros(0, dtype=dtype)
+    s, out = shapes(REAL[dtype]), smooth(REAL[dtype]).Wobble()
+    if smoothing is not None:
+        nodes, share = smoothing_nodes(smoothing)
+        out.noise, out.tangential, out.blur = smoothing.noise, int(smoothing.kind == "ring"), CONTACT_BLUR
+        out.reach = float(torch.linalg.vector_norm(nodes, dim=1).max())
+    return fill(out, {"nodes": (nodes, s.vec3), "share": (share, None)}, dtype, device)
+
+
+@torch.library.custom_op("physpose_torch::signed_distance", mutates_args=())
+def _signed_distance(
+    T_a: Tensor, T_b: Tensor, pairs: Tensor, parts: int, kind: str, noise: float, samples: int, seed: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    return _run("signed_distances", T_a, T_b, pairs, parts, _smoothing(kind, noise, samples, seed))
+
+
+@torch.library.custom_op("physpose_torch::drop_distance", mutates_args=())
+def _drop_distance(
+    T_a: Tensor,
+    T_b: Tensor,
+    pairs: Tensor,
+    parts: int,
+    kind: str,
+    noise: float,
+    samples: int,
+    seed: int,
+    gravity: Tensor,
+    limit: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    gravity = gravity.detach().contiguous()
+    return _run("drop_distances", T_a, T_b, pairs, parts, _smoothing(kind, noise, samples, seed), gravity, limit)
+
+
+def _run(name: str, T_a, T_b, pairs, parts: int, smoothing: Smoothing | None, *rest) -> tuple[Tensor, ...]:
+    T_a, T_b, pairs = T_a.detach().contiguous(), T_b.detach().contiguous(), pairs.contiguous()
+    out = _empty(T_a)
+    if len(pairs) == 0:
+        return out
+    dtype, device = T_a.dtype, T_a.device
+    kernels = ready(dtype, device)
+    s = kernels.s
+    rest = [wrap(x, s.vec3) if isinstance(x, Tensor) else x for x in rest]
+    inputs = [
+        parts_struct(ConvexParts.by_handle(parts), dtype, device),
+        wrap(pairs),
+        wrap(T_a, s.mat44),
+        wrap(T_b, s.mat44),
+        wobble_struct(smoothing, dtype, device),
+        *rest,
+    ]
+    kinds = (None, s.vec3, s.vec3, s.vec3, s.mat44, s.mat44)
+    outputs = [wrap(x, kind) for x, kind in zip(out, kinds, strict=True)]
+    launch(getattr(kernels, name), len(pairs), inputs, outputs, device)
+    return out
+
+
+def launch(kernel: Any, count: int, inputs: list, outputs: list, device: torch.device) -> None:
+    """Launch a kernel on the stream that torch is using."""
+    stream = wp.stream_from_torch(torch.cuda.current_stream(device)) if device.type == "cuda" else None
+    wp.launch(kernel, dim=count, inputs=inputs, outputs=outputs, device=wp.device_from_torch(device), stream=stream)
+
+
+def _smoothing(kind: str, noise: float, samples: int, seed: int) -> Smoothing | None:
+    return None if kind == "none" else Smoothing(kind, noise=noise, samples=samples, seed=seed)
+
+
+def _empty(T: Tensor) -> tuple[Tensor, ...]:
+    vector = T.new_zeros(len(T), 3)
+    return (
+        T.new_zeros(len(T)),
+        vector,
+        *(torch.zeros_like(vector) for _ in range(2)),
+        torch.zeros_like(T),
+        torch.zeros_like(T),
+    )
+
+
+def _fake(T_a: Tensor, *_) -> tuple[Tensor, ...]:
+    return _empty(T_a)
+
+
+for _op in (_signed_distance, _drop_distance):
+    _op.register_fake(_fake)
+
+
+class _Distance(torch.autograd.Function):
+    """An operator's distances; it has worked out their gradient as well."""
+
+    @staticmethod
+    def forward(ctx, T_a, T_b, operator, *rest):
+        distance, normal, point_a, point_b, *gradients = operator(T_a, T_b, *rest)
+        ctx.save_for_backward(*gradients)
+        ctx.mark_non_differentiable(normal, point_a, point_b)
+        ctx.n_rest = len(rest)
+        return distance, normal, point_a, point_b
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad_distance, *_):
+        weight = grad_distance[:, None, None]
+        return *(weight * gradient for gradient in ctx.saved_tensors), None, *([None] * ctx.n_rest)
+
+
+def warp_distance(
+    T_a: Tensor, T_b: Tensor, parts: ConvexParts, pairs: Tensor, smoothing: Smoothing | None
+) -> DistanceResult:
+    """See :func:`physpose_torch.distance.autograd.signed_distance`; computed in the poses' dtype and on their device."""
+    arguments = (pairs.to(T_a.device), parts.handle, *_plain(smoothing))
+    return DistanceResult(*_Distance.apply(T_a, T_b, _signed_distance, *arguments))
+
+
+def warp_drop(
+    T_a: Tensor,
+    T_b: Tensor,
+    parts: ConvexParts,
+    pairs: Tensor,
+    gravity: Tensor,
+    limit: float,
+    smoothing: Smoothing | None,
+) -> DistanceResult:
+    """See :func:`physpose_torch.distance.autograd.drop_distance`; computed in the poses' dtype and on their device."""
+    arguments = (pairs.to(T_a.device), parts.handle, *_plain(smoothing), gravity.to(T_a), limit)
+    return DistanceResult(*_Distance.apply(T_a, T_b, _drop_distance, *arguments))
+
+
+def _plain(smoothing: Smoothing | None) -> tuple[str, float, int, int]:
+    s = smoothing or Smoothing("none")
+    return s.kind, s.noise, s.samples, s.seed
+
+
+def warp_query(parts: ConvexParts, pairs: Tensor, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Exact distances as :func:`physpose_torch.distance.fcl.fcl_distance` gives them, for smoothing done elsewhere."""
+    T_b = se3.from_rotation_translation(R, t)
+    return warp_distance(torch.eye(4).to(T_b).expand_as(T_b), T_b, parts, pairs, None)
