@@ -6,122 +6,72 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from physpose_torch.config import RefinerConfig
+from physpose_torch.config import RefinerConfig, Smoothing
 from physpose_torch.distance.warp import REAL, fill, load, parts_struct, ready, wobble_struct, wrap
 from physpose_torch.fused_kernels import cost_kernels
 from physpose_torch.losses import PhysicsTerms
 from physpose_torch.prior import PosePrior
 from physpose_torch.scene import Scene
 
-__all__ = ["FusedCost"]
+__all__ = ["FusedCost", "FusedMeasure", "remembers"]
 
 FAR = 1e30
+MOST_PAIRS = 50_000_000
+"""Pairs of parts that a scene may have; each takes 32 bytes."""
+STILL_STEPS = 10
+"""An image stops after this many steps on end without motion."""
+LM_STILL_STEPS = 2
+"""A Gauss-Newton step that moves nothing is nearly proof enough."""
 
 
-class FusedCost:
-    """State of a refinement in flight, in place in torch tensors.
+def remembers(scene: Scene) -> bool:
+    """Whether every pair of parts can be remembered; a heap of thousands of objects in one image has too many."""
+    count = scene.instance_start.diff()[scene.entity_pairs]
+    return int((count[:, 0] * count[:, 1]).sum()) <= MOST_PAIRS
+
+
+class _Fused:
+    """A scene and its poses as the kernels see them, in place in torch tensors.
 
     Finished images cost nothing: every kernel leaves them out, so the batch is never rebuilt and the host need not know.
-
-    Args:
-        prior: the flat estimates.
-        scene: the flat scene.
-        acts: (N,) bool, see :func:`physpose_torch.losses.acting`.
-        config: options.
-        poses: (N, 4, 4) where to start.
-        scale: (N, 6, 6) L, steps are in units of it.
     """
 
-    def __init__(
-        self, prior: PosePrior, scene: Scene, acts: Tensor, config: RefinerConfig, poses: Tensor, scale: Tensor
-    ) -> None:
+    def __init__(self, scene: Scene, acts: Tensor, poses: Tensor, smoothing: Smoothing | None, falls: Tensor) -> None:
         self.n, self.n_images = len(scene), scene.n_images
         self.device, self.dtype = poses.device, poses.dtype
         ready(self.dtype, self.device)
         self._k = cost_kernels(REAL[self.dtype])
         load(self._k.module, self.device)
-        physics = self._physics = config.physics
-        smoothing = None if physics.smoothing.kind == "none" else physics.smoothing
         self._parts = parts_struct(scene.parts, self.dtype, self.device)
         self._wobble = wobble_struct(smoothing, self.dtype, self.device)
-        self._world = self._make_world(scene, acts)
-        self._prior = self._make_prior(prior, scale)
-        options = self._k.Options()
-        for name in ("pose_weight", "collision_weight", "gravity_weight", "softness"):
-            setattr(options, name, getattr(physics, name))
-        options.softness = max(options.softness, 1e-30)  # the paper's hinge, without a division by zero
-        options.reach, options.tolerance, options.max_step = physics.gravity_reach, config.tolerance, config.max_step
-        options.max_gradient = FAR if config.max_gradient is None else config.max_gradient
-        options.smooth = int(smoothing is not None)
-        self._state = self._make_state(scene, poses)
-        self.step = torch.zeros(self.n, 6, dtype=self.dtype, device=self.device)
-        self._commands = self._record(options)
-
-    @staticmethod
-    def fits(config: RefinerConfig) -> bool:
-        """Whether the kernels know this cost."""
-        physics = config.physics
-        return physics.gravity == "support" and physics.smoothing.kind in ("ring", "gaussian", "none")
+        self._world = self._make_world(scene, acts, falls)
+        self._tensor: dict[str, Tensor] = {}
 
     @property
     def poses(self) -> Tensor:
         """(N, 4, 4) now."""
         return self._tensor["poses"][: self.n]
 
-    @property
-    def gradient(self) -> Tensor:
-        """(N, 6) of the total cost with respect to steps in units of the scale; 0 for finished images."""
-        return self._tensor["gradient"]
-
-    @property
-    def done(self) -> Tensor:
-        """(I,) bool."""
-        return self._tensor["done"].bool()
-
-    @property
-    def steps(self) -> Tensor:
-        """(I,) long."""
-        return self._tensor["steps"].long()
-
-    def terms(self, rows: Tensor) -> PhysicsTerms:
-        """Costs of the objects ``rows`` at the poses of the last evaluation."""
-        pose, collision, share, gravity = (self._tensor[k][rows] for k in ("pose", "collision", "share", "gravity"))
-        w = self._physics
-        total = w.pose_weight * pose + w.collision_weight * share + w.gravity_weight * gravity
-        return PhysicsTerms(pose, collision, gravity, total)
-
-    def evaluate(self, step: int) -> None:
-        """Costs and gradient at the current poses; images that have come to rest are finished first."""
-        if self.n_images:
-            self._commands["priors"].set_param_at_index(3, step)
-        for name in ("boxes", "priors", "planes", "rows", "objects"):
-            if name in self._commands:
-                self._commands[name].launch()
-
-    def move(self) -> None:
-        """Move the objects by :attr:`step`, which is zero again then."""
-        self._commands["move"].launch()
-
     def _record(self, options: Any) -> dict[str, Any]:
-        k, state, world, parts, wobble = self._k, self._state, self._world, self._parts, self._wobble
-        n_entities, n_rows = len(self._tensor["moved"]), len(self._tensor["clear"])
-        launches = {
-            "boxes": (k.boxes, n_entities, [parts, world, state]),
-            "priors": (k.priors, self.n_images, [world, self._prior, state, 0, options.tolerance]),
-            "planes": (k.planes, self.n, [parts, world, state, options, wobble]),
-            "rows": (k.rows, n_rows, [parts, world, state, options, wobble]),
-            "objects": (k.objects, self.n, [parts, world, self._prior, state, options, wobble]),
-            "move": (k.move, self.n, [world, self._prior, state, options, wrap(self.step, k.vec6)]),
-        }
+        """The launches, with their arguments worked out once."""
         device = wp.device_from_torch(self.device)
         stream = wp.stream_from_torch(torch.cuda.current_stream(self.device)) if self.device.type == "cuda" else None
         return {
             name: wp.launch(kernel, dim=count, inputs=inputs, device=device, stream=stream, record_cmd=True)
-            for name, (kernel, count, inputs) in launches.items()
+            for name, (kernel, count, inputs) in self._launches(options).items()
             if count
         }
 
-    def _make_world(self, scene: Scene, acts: Tensor) -> Any:
+    def _launches(self, options: Any) -> dict[str, tuple[Any, int, list]]:
+        k, state, world, parts, wobble = self._k, self._state, self._world, self._parts, self._wobble
+        return {
+            "boxes": (k.boxes, len(self._tensor["moved"]), [parts, world, state]),
+            "planes": (k.planes, self.n, [parts, world, state, options, wobble]),
+            "rows": (k.rows, len(self._tensor["clear"]), [parts, world, state, options, wobble]),
+            "measure": (k.measure, self.n, [world, state, options]),
+        }
+
+    def _make_world(self, scene: Scene, acts: Tensor, falls: Tensor) -> Any:
         k, n = self._k, self.n
         count = torch.bincount(scene.image, minlength=scene.n_images)
         first, second = scene.entity_pairs.unbind(1)
@@ -135,10 +85,6 @@ class FusedCost:
         movable = second < n
         ends, sides = torch.cat([first, second[movable]]), torch.cat([pair, pair[movable]])
         planes = scene.plane_pairs
-        length = torch.linalg.vector_norm(scene.parts.padded, dim=-1).amax(1) if scene.parts.n_parts else torch.zeros(0)
-        span = torch.zeros(len(scene.entity_image), dtype=torch.float64)
-        span = span.scatter_reduce(0, scene.instance_entity, length[scene.instance_part].double(), "amax")
-        falls = (scene.gravity != 0).any(-1) & scene.has_static
         world = k.World()
         world.n_objects = n
         return fill(
@@ -169,12 +115,183 @@ class FusedCost:
                 "plane_offset": (scene.plane_offset, None),
                 "plane_covariance": (scene.plane_covariance, k.mat33),
                 "center": (scene.object_center, k.vec3),
-                "radius": (scene.object_radius, None),
-                "span": (span, None),
+                "span": (scene.entity_span, None),
             },
             self.dtype,
             self.device,
         )
+
+    def _make_state(self, scene: Scene, poses: Tensor, *, lm: bool) -> Any:
+        k, n, images = self._k, self.n, scene.n_images
+        entities, instances = len(scene.entity_image), len(scene.instance_entity)
+        rows, slots = len(self._world._tensors["row_pair"]), int(self._world._tensors["row_slot"][-1])
+        real = {"dtype": self.dtype, "device": self.device}
+        whole = {"dtype": torch.int32, "device": self.device}
+        empty = torch.bincount(scene.image, minlength=images) == 0  # nothing to do
+        shapes = {
+            **dict.fromkeys(("lower", "upper"), (instances, 3)),
+            **dict.fromkeys(("entity_lower", "entity_upper"), (entities, 3)),
+            "moved": (entities,),
+            "middle": (images, 3),
+            **dict.fromkeys(
+                ("farthest", "pose", "plane_cost", "plane_depth", "plane_height", "collision", "share", "gravity"), (n,)
+            ),
+            **dict.fromkeys(("depth_static", "depth_object", "height"), (n,)),
+            **dict.fromkeys(("pose_slope", "follow_gradient", "follow_follow"), (n,)),
+            **dict.fromkeys(("newton", "follow"), (n, 6)),
+            "information": (images,),
+            "plane_curvature": (n if lm else 0, 6, 6),
+            **dict.fromkeys(("row_curvature_a", "row_curvature_b"), (rows if lm else 0, 6, 6)),
+            **dict.fromkeys(("pose_gradient", "plane_gradient", "gradient"), (n, 6)),
+            **dict.fromkeys(("row_cost", "row_depth", "row_drop_a", "row_drop_b"), (rows,)),
+            **dict.fromkeys(("row_force", "row_torque_a", "row_torque_b"), (rows, 3)),
+        }
+        counters = {
+            "still": images,
+            **dict.fromkeys(("plane_best", "plane_instance", "support"), n),
+            **dict.fromkeys(("row_count", "row_onto_a", "row_onto_b"), rows),
+        }
+        self._tensor = {name: torch.zeros(shape, **real) for name, shape in shapes.items()}
+        self._tensor |= {name: torch.zeros(size, **whole) for name, size in counters.items()}
+        self._tensor["poses"] = scene.entity_poses(poses).detach().to(**real).clone().contiguous()
+        self._tensor["clear"] = torch.full((rows,), -FAR, **real)
+        self._tensor["slot_clear"] = torch.full((slots,), -FAR, **real)
+        self._tensor["slot_normal"] = torch.zeros(slots, 3, **real)
+        self._tensor["farthest"].fill_(FAR)  # nothing is at rest before it has moved
+        self._tensor["done"] = empty.to(**whole)
+        self._tensor["steps"] = torch.zeros(images, **whole)
+        kinds = {(3,): k.vec3, (6,): k.vec6, (4, 4): k.mat44, (6, 6): k.mat66}
+        state = k.State()
+        for name, tensor in self._tensor.items():
+            kind = kinds.get(tuple(tensor.shape[1:]))
+            setattr(state, name, wrap(tensor, kind))
+        return state
+
+    def _launch(self, *names: str) -> None:
+        for name in names:
+            if name in self._commands:
+                self._commands[name].launch()
+
+
+class FusedMeasure(_Fused):
+    """Penetrations, heights and supports of posed objects, see :class:`physpose_torch.report.PhysicsReport`.
+
+    Args:
+        scene: the flat scene.
+        acts: (N,) bool, see :func:`physpose_torch.losses.acting`.
+        poses: (N, 4, 4).
+        reach: [m], how far down supports are looked for.
+    """
+
+    def __init__(self, scene: Scene, acts: Tensor, poses: Tensor, *, reach: float) -> None:
+        super().__init__(scene, acts, poses, None, (scene.gravity != 0).any(-1))
+        options = self._k.Options()
+        options.collision_weight = options.gravity_weight = options.softness = 1.0
+        options.reach, options.smooth = reach, -1
+        self._state = self._make_state(scene, poses, lm=False)
+        self._commands = self._record(options)
+        self._launch("boxes", "planes", "rows", "measure")
+        self.depth_static, self.depth_object = self._tensor["depth_static"], self._tensor["depth_object"]
+        height = self._tensor["height"]
+        self.height = torch.where(height <= reach, height, torch.inf)
+        """(N,) [m], infinite where nothing is within reach."""
+        self.support = self._tensor["support"].long()
+        """(N,) entity, planes last; -1: none."""
+
+
+class FusedCost(_Fused):
+    """State of a refinement in flight.
+
+    Args:
+        prior: the flat estimates.
+        scene: the flat scene.
+        acts: (N,) bool, see :func:`physpose_torch.losses.acting`.
+        config: options.
+        poses: (N, 4, 4) where to start.
+        scale: (N, 6, 6) L, steps are in units of it.
+    """
+
+    def __init__(
+        self, prior: PosePrior, scene: Scene, acts: Tensor, config: RefinerConfig, poses: Tensor, scale: Tensor
+    ) -> None:
+        physics = self._physics = config.physics
+        smoothing = None if physics.smoothing.kind == "none" else physics.smoothing
+        super().__init__(scene, acts, poses, smoothing, (scene.gravity != 0).any(-1) & scene.has_static)
+        self._prior = self._make_prior(prior, scale)
+        lm = config.solver == "lm"
+        options = self._k.Options()
+        for name in ("pose_weight", "collision_weight", "gravity_weight", "softness"):
+            setattr(options, name, getattr(physics, name))
+        options.softness = max(options.softness, 1e-30)  # the paper's hinge, without a division by zero
+        options.reach, options.tolerance, options.max_step = physics.gravity_reach, config.tolerance, config.max_step
+        options.max_gradient = FAR if config.max_gradient is None else config.max_gradient
+        options.smooth, options.newton, options.damping = int(smoothing is not None), int(lm), config.damping
+        options.still_steps = LM_STILL_STEPS if lm else STILL_STEPS
+        self._state = self._make_state(scene, poses, lm=lm)
+        self.step = torch.zeros(self.n, 6, dtype=self.dtype, device=self.device)
+        self._commands = self._record(options)
+
+    @staticmethod
+    def fits(config: RefinerConfig, scene: Scene) -> bool:
+        """Whether the kernels know this cost, and remember all pairs of parts in the memory that there is."""
+        physics = config.physics
+        known = physics.gravity == "support" and physics.smoothing.kind in ("ring", "gaussian", "none")
+        return known and remembers(scene)
+
+    @property
+    def gradient(self) -> Tensor:
+        """(N, 6) of the total cost with respect to steps in units of the scale; 0 for finished images."""
+        return self._tensor["gradient"]
+
+    @property
+    def done(self) -> Tensor:
+        """(I,) bool."""
+        return self._tensor["done"].bool()
+
+    @property
+    def steps(self) -> Tensor:
+        """(I,) long."""
+        return self._tensor["steps"].long()
+
+    def terms(self, rows: Tensor) -> PhysicsTerms:
+        """Costs of the objects ``rows`` at the poses of the last evaluation."""
+        pose, collision, share, gravity = (self._tensor[k][rows] for k in ("pose", "collision", "share", "gravity"))
+        w = self._physics
+        total = w.pose_weight * pose + w.collision_weight * share + w.gravity_weight * gravity
+        return PhysicsTerms(pose, collision, gravity, total)
+
+    def all_terms(self) -> PhysicsTerms:
+        """Costs of all objects at the current poses; nothing is left to do then."""
+        self._tensor["done"].zero_()
+        self._tensor["still"].fill_(-1)
+        self.evaluate(0)
+        return self.terms(torch.arange(self.n, device=self.device))
+
+    def evaluate(self, step: int) -> None:
+        """Costs and gradient at the current poses; images that have come to rest are finished first."""
+        if self.n_images:
+            self._commands["priors"].set_param_at_index(3, step)
+        self._launch("boxes", "priors", "planes", "rows", "objects")
+
+    def newton(self, fraction: float = 1.0) -> None:
+        """Set :attr:`step` to a fraction of the damped Gauss-Newton step."""
+        if "newton" in self._commands:
+            self._commands["newton"].set_param_at_index(4, fraction)
+            self._commands["newton"].launch()
+
+    def move(self) -> None:
+        """Move the objects by :attr:`step`, which is zero again then."""
+        self._launch("move")
+
+    def _launches(self, options: Any) -> dict[str, tuple[Any, int, list]]:
+        k, state, world, parts, wobble = self._k, self._state, self._world, self._parts, self._wobble
+        prior, step = self._prior, wrap(self.step, k.vec6)
+        return super()._launches(options) | {
+            "priors": (k.priors, self.n_images, [world, prior, state, 0, options]),
+            "objects": (k.objects, self.n, [parts, world, prior, state, options, wobble]),
+            "newton": (k.newton, self.n, [world, prior, state, options, 1.0, step]),
+            "move": (k.move, self.n, [world, prior, state, options, step]),
+        }
 
     def _make_prior(self, prior: PosePrior, scale: Tensor) -> Any:
         k = self._k
@@ -195,43 +312,6 @@ class FusedCost:
             self.dtype,
             self.device,
         )
-
-    def _make_state(self, scene: Scene, poses: Tensor) -> Any:
-        k, n, images = self._k, self.n, scene.n_images
-        entities, instances = len(scene.entity_image), len(scene.instance_entity)
-        rows, slots = len(self._world._tensors["row_pair"]), int(self._world._tensors["row_slot"][-1])
-        real = {"dtype": self.dtype, "device": self.device}
-        whole = {"dtype": torch.int32, "device": self.device}
-        empty = torch.bincount(scene.image, minlength=images) == 0  # nothing to do
-        shapes = {
-            **dict.fromkeys(("lower", "upper"), (instances, 3)),
-            **dict.fromkeys(("entity_lower", "entity_upper"), (entities, 3)),
-            "moved": (entities,),
-            "middle": (images, 3),
-            **dict.fromkeys(("farthest", "pose", "plane_cost", "plane_height", "collision", "share", "gravity"), (n,)),
-            **dict.fromkeys(("pose_gradient", "plane_gradient", "gradient"), (n, 6)),
-            **dict.fromkeys(("row_cost", "row_drop_a", "row_drop_b"), (rows,)),
-            **dict.fromkeys(("row_force", "row_torque_a", "row_torque_b"), (rows, 3)),
-        }
-        counters = {
-            "still": images,
-            **dict.fromkeys(("plane_best", "plane_instance"), n),
-            **dict.fromkeys(("row_count", "row_onto_a", "row_onto_b"), rows),
-        }
-        self._tensor = {name: torch.zeros(shape, **real) for name, shape in shapes.items()}
-        self._tensor |= {name: torch.zeros(size, **whole) for name, size in counters.items()}
-        self._tensor["poses"] = scene.entity_poses(poses).detach().to(**real).clone().contiguous()
-        self._tensor["clear"] = torch.full((rows,), -FAR, **real)
-        self._tensor["slot_clear"] = torch.full((slots,), -FAR, **real)
-        self._tensor["slot_normal"] = torch.zeros(slots, 3, **real)
-        self._tensor["done"] = empty.to(**whole)
-        self._tensor["steps"] = torch.zeros(images, **whole)
-        kinds = {3: k.vec3, 6: k.vec6}
-        state = k.State()
-        for name, tensor in self._tensor.items():
-            kind = k.mat44 if name == "poses" else kinds[tensor.shape[1]] if tensor.ndim == 2 else None
-            setattr(state, name, wrap(tensor, kind))
-        return state
 
 
 def _starts(count: Tensor) -> Tensor:

@@ -11,14 +11,12 @@ import warp as wp
 
 from physpose_torch.contacts import SUPPORT_SLOPE
 from physpose_torch.distance.kernels.drop import HITS
-from physpose_torch.distance.kernels.pair import pairs
+from physpose_torch.distance.kernels.pair import OPTIONS, pairs
 from physpose_torch.distance.kernels.smooth import smooth
 from physpose_torch.prior import REWEIGHTINGS
 
 __all__ = ["cost_kernels"]
 
-STILL_STEPS = 10
-"""An image stops after this many steps on end without motion."""
 REACHED = {wp.float32: 1e-7, wp.float64: 1e-9}
 """[m]; parts nearer than this touch."""
 
@@ -33,7 +31,9 @@ def cost_kernels(real: type) -> SimpleNamespace:
     make_pair, across = s.make_pair, s.across
     distance, fall, smoothed, moments, basis, Points = p.distance, p.fall, m.smoothed, m.moments, m.basis, m.Points
     vec6 = wp.types.vector(6, real)
+    mat66 = wp.types.matrix((6, 6), real)
     module = wp.get_module(f"physpose_torch.fused.{real.__name__}")
+    module.options |= OPTIONS
     zero, one, half, two = real(0.0), real(1.0), real(0.5), real(2.0)
     far = real(1e30)
     reached = real(REACHED[real])
@@ -66,7 +66,6 @@ def cost_kernels(real: type) -> SimpleNamespace:
         plane_offset: wp.array(dtype=real)
         plane_covariance: wp.array(dtype=mat33)
         center: wp.array(dtype=vec3)
-        radius: wp.array(dtype=real)
         span: wp.array(dtype=real)
         """Largest distance of a point of each entity from its origin."""
 
@@ -95,7 +94,12 @@ def cost_kernels(real: type) -> SimpleNamespace:
         max_gradient: real
         max_step: real
         tolerance: real
+        still_steps: wp.int32
         smooth: wp.int32
+        """1: smoothed witness points, 0: hard ones, -1: none at all."""
+        newton: wp.int32
+        """Whether curvatures are needed as well."""
+        damping: real
 
     @wp.struct
     class State:
@@ -115,8 +119,14 @@ def cost_kernels(real: type) -> SimpleNamespace:
         middle: wp.array(dtype=vec3)
         pose: wp.array(dtype=real)
         pose_gradient: wp.array(dtype=vec6)
+        pose_slope: wp.array(dtype=real)
+        """Weight of the estimate in the robust cost."""
+        information: wp.array(dtype=real)
+        """Curvature of an image's cost in its depth factor."""
         plane_cost: wp.array(dtype=real)
         plane_gradient: wp.array(dtype=vec6)
+        plane_curvature: wp.array(dtype=mat66)
+        plane_depth: wp.array(dtype=real)
         plane_height: wp.array(dtype=real)
         plane_best: wp.array(dtype=wp.int32)
         plane_instance: wp.array(dtype=wp.int32)
@@ -128,9 +138,12 @@ def cost_kernels(real: type) -> SimpleNamespace:
         """The normal found then."""
         row_cost: wp.array(dtype=real)
         row_count: wp.array(dtype=wp.int32)
+        row_depth: wp.array(dtype=real)
         row_force: wp.array(dtype=vec3)
         row_torque_a: wp.array(dtype=vec3)
         row_torque_b: wp.array(dtype=vec3)
+        row_curvature_a: wp.array(dtype=mat66)
+        row_curvature_b: wp.array(dtype=mat66)
         row_drop_a: wp.array(dtype=real)
         row_drop_b: wp.array(dtype=real)
         row_onto_a: wp.array(dtype=wp.int32)
@@ -138,7 +151,17 @@ def cost_kernels(real: type) -> SimpleNamespace:
         collision: wp.array(dtype=real)
         share: wp.array(dtype=real)
         gravity: wp.array(dtype=real)
+        depth_static: wp.array(dtype=real)
+        depth_object: wp.array(dtype=real)
+        height: wp.array(dtype=real)
+        support: wp.array(dtype=wp.int32)
         gradient: wp.array(dtype=vec6)
+        newton: wp.array(dtype=vec6)
+        """D⁻¹ gradient, D the curvature; in units of the scale."""
+        follow: wp.array(dtype=vec6)
+        """D⁻¹ w, w how the gradient changes with the depth factor."""
+        follow_gradient: wp.array(dtype=real)
+        follow_follow: wp.array(dtype=real)
 
     @wp.func
     def join(a: vec3, b: vec3):
@@ -209,6 +232,38 @@ def cost_kernels(real: type) -> SimpleNamespace:
             out[k] = wp.dot(prior.precision[6 * i + k], e)
         return out
 
+    @wp.func
+    def cholesky(D: mat66):
+        """Lower triangle L of D = L Lᵀ; D is positive definite, for it is damped."""
+        L = mat66()
+        for r in range(6):
+            for c in range(r + 1):
+                total = D[r, c]
+                for k in range(c):
+                    total -= L[r, k] * L[c, k]
+                if r == c:
+                    L[r, r] = wp.sqrt(wp.max(total, real(1e-12)))
+                else:
+                    L[r, c] = total / L[c, c]
+        return L
+
+    @wp.func
+    def solve(L: mat66, x: vec6):
+        """(L Lᵀ)⁻¹ x."""
+        y = vec6()
+        for r in range(6):
+            total = x[r]
+            for k in range(r):
+                total -= L[r, k] * y[k]
+            y[r] = total / L[r, r]
+        for q in range(6):
+            r = 5 - q
+            total = y[r]
+            for k in range(r + 1, 6):
+                total -= L[k, r] * y[k]
+            y[r] = total / L[r, r]
+        return y
+
     @wp.kernel(enable_backward=False, module=module)
     def boxes(parts: Parts, world: World, state: State):
         """Boxes of instances and entities in the frame whose third axis is gravity."""
@@ -240,25 +295,24 @@ def cost_kernels(real: type) -> SimpleNamespace:
         state.entity_upper[e] = high
 
     @wp.kernel(enable_backward=False, module=module)
-    def priors(world: World, prior: Prior, state: State, step: wp.int32, tolerance: real):
+    def priors(world: World, prior: Prior, state: State, step: wp.int32, options: Options):
         """Who has come to rest; then the pose costs of an image, its common depth factor eliminated."""
         image = wp.tid()
         if state.done[image] == 1:
             return
         first = world.image_start[image]
         last = world.image_start[image + 1]
-        if step > 0:
-            farthest = zero
-            for k in range(first, last):
-                farthest = wp.max(farthest, state.farthest[world.image_object[k]])
-            if farthest <= tolerance:
-                state.still[image] = state.still[image] + 1
-            else:
-                state.still[image] = 0
-            if state.still[image] >= STILL_STEPS:
-                state.done[image] = 1
-                state.steps[image] = step
-                return
+        farthest = zero
+        for k in range(first, last):
+            farthest = wp.max(farthest, state.farthest[world.image_object[k]])
+        if farthest <= options.tolerance:
+            state.still[image] = state.still[image] + 1
+        else:
+            state.still[image] = 0
+        if state.still[image] >= options.still_steps:
+            state.done[image] = 1
+            state.steps[image] = step
+            return
         count = zero
         middle = vec3(zero, zero, zero)
         for k in range(first, last):
@@ -292,6 +346,9 @@ def cost_kernels(real: type) -> SimpleNamespace:
                         numerator += weight * kept[1]
                         information += weight * prior.curvature[i]
                 factor = numerator / information
+        information = zero
+        if prior.sigma_common > zero:
+            information = one / (prior.sigma_common * prior.sigma_common)
         for k in range(first, last):
             i = world.image_object[k]
             e = residual(prior, state.poses, i)
@@ -308,7 +365,11 @@ def cost_kernels(real: type) -> SimpleNamespace:
                 cost += half * ratio * ratio / count
             turn = times_inverse_jacobian(vec3(e[3], e[4], e[5]), vec3(He[3], He[4], He[5]))
             state.pose[i] = cost
+            state.pose_slope[i] = slope
+            if world.acts[i] == 1:
+                information += slope * prior.curvature[i]
             state.pose_gradient[i] = slope * join(vec3(He[0], He[1], He[2]), turn)
+        state.information[image] = information
 
     @wp.func
     def plane_softness(world: World, state: State, options: Options, weight: real, i: wp.int32, plane: wp.int32):
@@ -322,7 +383,7 @@ def cost_kernels(real: type) -> SimpleNamespace:
     @wp.func
     def lowest_point(parts: Parts, part: wp.int32, down: vec3, wobble: Wobble, smoothing: wp.int32):
         """Where a part touches what lies across ``down``, in its body's frame."""
-        if smoothing == 0:
+        if smoothing <= 0:
             return parts.vertices[s.farthest(parts, part, down)]
         frame = basis(down)
         x = moments(parts, part, wp.identity(n=3, dtype=real), frame, wobble)
@@ -339,6 +400,8 @@ def cost_kernels(real: type) -> SimpleNamespace:
         t = translation(state.poses[i])
         cost = zero
         gradient = vec6()
+        curvature = mat66()
+        depth = zero
         best = far
         best_plane = int(-1)
         best_instance = int(-1)
@@ -352,6 +415,7 @@ def cost_kernels(real: type) -> SimpleNamespace:
             sum = zero
             force = zero
             torque = vec3(zero, zero, zero)
+            block = mat66()
             lowest = far
             lowest_instance = int(-1)
             for q in range(world.instance_start[i], world.instance_start[i + 1]):
@@ -360,6 +424,7 @@ def cost_kernels(real: type) -> SimpleNamespace:
                 if height < lowest:
                     lowest = height
                     lowest_instance = q
+                    depth = wp.max(depth, -height)
                 if height < zero:
                     count += one
                     sum += hinge(-height, softness)
@@ -367,9 +432,14 @@ def cost_kernels(real: type) -> SimpleNamespace:
                     point = lowest_point(parts, part, -up, wobble, options.smooth)
                     force -= slope
                     torque -= slope * wp.cross(point, up)
+                    if options.newton == 1:
+                        j = join(normal, wp.cross(point, up))
+                        block += slope / -height * wp.outer(j, j)
             if count > zero:
                 cost += sum / count
                 gradient += join(force / count * normal, torque / count)
+                if options.newton == 1:
+                    curvature += (one / count) * block
             slope = -wp.dot(normal, world.gravity[image])
             if slope >= support_slope:
                 above = wp.max(lowest, zero) / slope
@@ -378,7 +448,10 @@ def cost_kernels(real: type) -> SimpleNamespace:
                     best_plane = plane
                     best_instance = lowest_instance
         state.plane_cost[i] = cost
+        state.plane_depth[i] = depth
         state.plane_gradient[i] = gradient
+        if options.newton == 1:
+            state.plane_curvature[i] = curvature
         state.plane_height[i] = best
         state.plane_best[i] = best_plane
         state.plane_instance[i] = best_instance
@@ -436,6 +509,7 @@ def cost_kernels(real: type) -> SimpleNamespace:
         limit_b = may_fall(world, state, options, b, a)
         state.row_cost[r] = zero
         state.row_count[r] = 0
+        state.row_depth[r] = zero
         state.row_drop_a[r] = far
         state.row_drop_b[r] = far
         travelled = state.moved[a] + state.moved[b]
@@ -460,9 +534,12 @@ def cost_kernels(real: type) -> SimpleNamespace:
         part_a = world.instance_part[i]
         cost = zero
         count = int(0)
+        depth = zero
         force = vec3(zero, zero, zero)
         torque_a = vec3(zero, zero, zero)
         torque_b = vec3(zero, zero, zero)
+        curvature_a = mat66()
+        curvature_b = mat66()
         best_a = limit_a
         best_b = limit_b
         onto_a = int(-1)
@@ -479,7 +556,7 @@ def cost_kernels(real: type) -> SimpleNamespace:
             part_b = world.instance_part[j]
             inside = int(0)
             normal = vec3(zero, zero, zero)
-            if gap == zero:
+            if gap <= reached:
                 both = make_pair(parts, part_a, part_b, R, t)
                 hint = state.slot_normal[slot]
                 if wp.dot(hint, hint) == zero:
@@ -487,7 +564,7 @@ def cost_kernels(real: type) -> SimpleNamespace:
                 overlapping = int(0)
                 if state.slot_clear[slot] == -one:
                     overlapping = 1
-                d = distance(parts, both, hint, overlapping, zero, 0)
+                d = distance(parts, both, hint, overlapping, zero, wp.where(options.smooth == 0, 1, 0))
                 gap = d.value
                 state.slot_normal[slot] = d.normal
                 if gap <= reached:
@@ -495,20 +572,25 @@ def cost_kernels(real: type) -> SimpleNamespace:
                     normal = R_a * d.normal
                 if gap < zero:
                     point = Points()
+                    point.a = d.a
+                    point.b = d.b
                     if options.smooth == 1:
                         point = smoothed(parts, both, d.normal, wobble)
-                    else:
-                        w = distance(parts, both, d.normal, 1, zero, 1)
-                        point.a = w.a
-                        point.b = w.b
                     slope = hinge_slope(-gap, options.softness)
                     cost += hinge(-gap, options.softness)
                     count += 1
+                    depth = wp.max(depth, -gap)
                     n = slope * d.normal
                     force += R_a * n
                     torque_a += wp.cross(point.a, n)
                     back_b = wp.transpose(R)
                     torque_b -= wp.cross(back_b * (point.b - t), back_b * n)
+                    if options.newton == 1:
+                        facing = R_a * d.normal
+                        ja = join(facing, wp.cross(point.a, d.normal))
+                        jb = join(facing, wp.cross(back_b * (point.b - t), back_b * d.normal))
+                        curvature_a += slope / -gap * wp.outer(ja, ja)
+                        curvature_b += slope / -gap * wp.outer(jb, jb)
             clear = wp.min(clear, wp.max(gap, zero))
             state.slot_clear[slot] = gap + travelled
             if gap < zero:
@@ -536,9 +618,13 @@ def cost_kernels(real: type) -> SimpleNamespace:
         state.clear[r] = clear + travelled
         state.row_cost[r] = cost
         state.row_count[r] = count
+        state.row_depth[r] = depth
         state.row_force[r] = force
         state.row_torque_a[r] = torque_a
         state.row_torque_b[r] = torque_b
+        if options.newton == 1 and count > 0:
+            state.row_curvature_a[r] = curvature_a
+            state.row_curvature_b[r] = curvature_b
         if onto_a >= 0:
             state.row_drop_a[r] = best_a
             state.row_onto_a[r] = onto_a
@@ -560,6 +646,14 @@ def cost_kernels(real: type) -> SimpleNamespace:
         collision = state.plane_cost[i]
         share = collision
         gradient = options.pose_weight * state.pose_gradient[i] + options.collision_weight * state.plane_gradient[i]
+        curvature = mat66()
+        if options.newton == 1:
+            curvature = options.collision_weight * state.plane_curvature[i]
+            for k in range(6):
+                for c in range(6):
+                    curvature[k, c] = curvature[k, c] + (
+                        options.pose_weight * state.pose_slope[i] * prior.precision[6 * i + k][c]
+                    )
         height = state.plane_height[i]
         other = int(-1)
         own_instance = state.plane_instance[i]
@@ -572,6 +666,7 @@ def cost_kernels(real: type) -> SimpleNamespace:
             cost = zero
             force = vec3(zero, zero, zero)
             torque = vec3(zero, zero, zero)
+            block = mat66()
             for r in range(world.pair_row[pair], world.pair_row[pair + 1]):
                 if state.row_count[r] > 0:
                     count += state.row_count[r]
@@ -579,9 +674,13 @@ def cost_kernels(real: type) -> SimpleNamespace:
                     if first == i:
                         force += state.row_force[r]
                         torque += state.row_torque_a[r]
+                        if options.newton == 1:
+                            block += state.row_curvature_a[r]
                     else:
                         force -= state.row_force[r]
                         torque += state.row_torque_b[r]
+                        if options.newton == 1:
+                            block += state.row_curvature_b[r]
                 if first == i:
                     if state.row_drop_a[r] < height:
                         height = state.row_drop_a[r]
@@ -612,6 +711,12 @@ def cost_kernels(real: type) -> SimpleNamespace:
                         cost = half * cost
                     share += cost
                     gradient += options.collision_weight / real(count) * join(force, torque)
+                    if options.newton == 1:
+                        # both bodies move: (x + y)² ≤ 2x² + 2y² keeps their blocks apart
+                        weight = options.collision_weight / real(count)
+                        if partner_moves == 1:
+                            weight = two * weight
+                        curvature += weight * block
         gravity = zero
         if height > zero and height <= options.reach and options.gravity_weight > zero and world.falls[image] == 1:
             softness = options.softness
@@ -623,6 +728,9 @@ def cost_kernels(real: type) -> SimpleNamespace:
                 rate = -wp.dot(world.plane_normal[plane], g)
                 slope = options.gravity_weight * hinge_slope(height, softness) / rate
                 gradient += slope * join(world.plane_normal[plane], wp.cross(point, up))
+                if options.newton == 1:
+                    j = join(world.plane_normal[plane], wp.cross(point, up))
+                    curvature += (slope / (height * rate)) * wp.outer(j, j)
             else:
                 part_a = world.instance_part[own_instance]
                 part_b = world.instance_part[other_instance]
@@ -638,6 +746,9 @@ def cost_kernels(real: type) -> SimpleNamespace:
                 rate = wp.dot(hit.normal, back * g)
                 slope = -options.gravity_weight * hinge_slope(height, softness) / rate
                 gradient += slope * join(R * hit.normal, wp.cross(point, hit.normal))
+                if options.newton == 1:
+                    j = join(R * hit.normal, wp.cross(point, hit.normal))
+                    curvature += (-slope / (height * rate)) * wp.outer(j, j)
             gravity = hinge(height, softness)
         state.collision[i] = collision
         state.share[i] = share
@@ -646,9 +757,84 @@ def cost_kernels(real: type) -> SimpleNamespace:
         for k in range(6):
             scaled += gradient[k] * prior.scale[6 * i + k]
         length = wp.length(scaled)
-        if length > options.max_gradient:
+        if length > options.max_gradient and options.newton == 0:
             scaled = options.max_gradient / length * scaled
         state.gradient[i] = scaled
+        if options.newton == 1:
+            # in units of the scale: the prior is near the identity there, so the damping is in its units
+            D = mat66()
+            for k in range(6):
+                column = vec6()
+                for c in range(6):
+                    x = vec6()
+                    for q in range(6):
+                        x[q] = curvature[c, q]
+                    for q in range(6):
+                        column[c] = column[c] + x[q] * prior.scale[6 * i + q][k]
+                for c in range(6):
+                    total = zero
+                    for q in range(6):
+                        total += prior.scale[6 * i + q][c] * column[q]
+                    D[c, k] = total
+                D[k, k] = D[k, k] + options.damping
+            w = vec6()
+            for k in range(6):
+                w += (options.pose_weight * state.pose_slope[i] * prior.toward[i][k]) * prior.scale[6 * i + k]
+            L = cholesky(D)
+            y = solve(L, scaled)
+            z = solve(L, w)
+            state.newton[i] = y
+            state.follow[i] = z
+            state.follow_gradient[i] = wp.dot(w, y)
+            state.follow_follow[i] = wp.dot(w, z)
+
+    @wp.kernel(enable_backward=False, module=module)
+    def measure(world: World, state: State, options: Options):
+        """How deep each object is inside statics and inside other objects, how high it is, and above what."""
+        i = wp.tid()
+        inside = state.plane_depth[i]
+        among = zero
+        height = state.plane_height[i]
+        support = int(-1)
+        if height <= options.reach:
+            support = world.image.shape[0] + state.plane_best[i]
+        for k in range(world.object_pair_start[i], world.object_pair_start[i + 1]):
+            pair = world.object_pair[k]
+            partner = world.pair_first[pair] + world.pair_second[pair] - i
+            for r in range(world.pair_row[pair], world.pair_row[pair + 1]):
+                if partner >= world.n_objects:
+                    inside = wp.max(inside, state.row_depth[r])
+                elif world.acts[partner] == 1:
+                    among = wp.max(among, state.row_depth[r])
+                drop = state.row_drop_a[r]
+                if world.pair_second[pair] == i:
+                    drop = state.row_drop_b[r]
+                if drop < height:
+                    height = drop
+                    support = partner
+        state.depth_static[i] = inside
+        state.depth_object[i] = among
+        state.height[i] = height
+        state.support[i] = support
+
+    @wp.kernel(enable_backward=False, module=module)
+    def newton(world: World, prior: Prior, state: State, options: Options, fraction: real, step: wp.array(dtype=vec6)):
+        """The Gauss-Newton step: blocks of objects, joined by the depth factor of their image."""
+        i = wp.tid()
+        image = world.image[i]
+        if state.done[image] == 1:
+            return
+        shift = zero
+        if prior.sigma_common > zero:
+            numerator = zero
+            denominator = options.pose_weight * state.information[image]
+            for k in range(world.image_start[image], world.image_start[image + 1]):
+                j = world.image_object[k]
+                if world.acts[j] == 1:
+                    numerator += state.follow_gradient[j]
+                    denominator -= state.follow_follow[j]
+            shift = -numerator / denominator
+        step[i] = fraction * (shift * state.follow[i] - state.newton[i])
 
     @wp.kernel(enable_backward=False, module=module)
     def move(world: World, prior: Prior, state: State, options: Options, step: wp.array(dtype=vec6)):
@@ -662,7 +848,7 @@ def cost_kernels(real: type) -> SimpleNamespace:
         dw = vec3(
             wp.dot(prior.scale[6 * i + 3], x), wp.dot(prior.scale[6 * i + 4], x), wp.dot(prior.scale[6 * i + 5], x)
         )
-        reach = wp.length(dt) + wp.length(dw) * world.radius[i]
+        reach = wp.length(dt) + wp.length(dw) * world.span[i]
         state.farthest[i] = reach
         if reach > options.max_step:
             dt = options.max_step / reach * dt
@@ -676,6 +862,6 @@ def cost_kernels(real: type) -> SimpleNamespace:
             zero, zero, zero, one,
         )  # fmt: skip
         # a little more than exact arithmetic asks for
-        state.moved[i] = state.moved[i] + real(1.001) * (wp.length(dt) + wp.length(dw) * world.span[i])
+        state.moved[i] = state.moved[i] + real(1.001) * wp.min(reach, options.max_step)
 
     return SimpleNamespace(**locals())

@@ -13,6 +13,7 @@ from physpose_torch.prior import make_prior
 from physpose_torch.report import PhysicsReport, physics_report
 from physpose_torch.scene import Scene
 from physpose_torch.solvers.descent import descend
+from physpose_torch.solvers.lm import levenberg_marquardt
 
 __all__ = ["PhysPoseRefiner", "Refinement"]
 
@@ -108,12 +109,10 @@ class PhysPoseRefiner(nn.Module):
             covariance = flatten_covariance(measured_covariance, measured)
             acts = acting(scene, scores).repeat(leading.numel())
             prior = make_prior(measured.reshape(-1, 4, 4), many, acts, covariance, self.config.physics)
-            result = descend(prior, many, acts, self.config, callback)
+            solve = levenberg_marquardt if self.config.solver == "lm" else descend
+            result = solve(prior, many, acts, self.config, callback)
             refined = result.poses.reshape(measured.shape)
-            with torch.no_grad():
-                terms = self.loss(
-                    refined, scene, measured=measured, measured_covariance=measured_covariance, scores=scores
-                )
+            terms = (x.reshape(measured.shape[:-2]) for x in result.terms)
             report = physics_report(refined, scene, scores=scores, backend=self.config.physics.backend)
         lengths = ("penetration_static", "penetration_object", "gap")
         report = replace(report, **{name: getattr(report, name).to(poses.dtype) for name in lengths})

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from physpose_torch.contacts import find_contacts, find_drops
+from physpose_torch.distance.autograd import chosen_backend
 from physpose_torch.losses import acting, check_poses
 from physpose_torch.scene import Scene
 
@@ -81,27 +82,46 @@ def physics_report(
     leading = poses.shape[:-3]
     with torch.inference_mode(False), torch.no_grad():
         flat = poses.detach().clone().double().reshape(-1, 4, 4)
-        many = Scene.cat([scene] * leading.numel())
+        many = scene if leading.numel() == 1 else Scene.cat([scene] * leading.numel())
         acts = acting(scene, scores).repeat(leading.numel())
-        contacts = find_contacts(flat, many, acts=acts, backend=backend)
-        depth = (-contacts.distance).clamp_min(0.0)
-        first, second = contacts.pair_first[contacts.pair], contacts.pair_second[contacts.pair]
-        static = second >= len(many)
-        felt_first, felt_second = contacts.moves_first[contacts.pair], contacts.moves_second[contacts.pair]
-        in_static, in_object = flat.new_zeros(len(many)), flat.new_zeros(len(many))
-        in_static = in_static.scatter_reduce(0, first[static], depth[static], "amax")
-        for who, felt in ((first, felt_first), (second, felt_second)):
-            among = ~static & felt
-            in_object = in_object.scatter_reduce(0, who[among], depth[among], "amax")
-        drops = find_drops(flat, many, acts=acts, reach=REACH, backend=backend)
+        fused = chosen_backend(backend) == "warp" and _remembered(many)
+        in_static, in_object, height, support = (_fused if fused else _measure)(flat, many, acts, backend)
         falls = (many.gravity != 0).any(-1)[many.image].to(flat.device)
-        gap = torch.where(falls, drops.height, torch.nan)
-        support = torch.where(falls, drops.support, -1)
+        gap = torch.where(falls, height, torch.nan)
+        support = torch.where(falls, support, -1)
         copy = torch.arange(leading.numel(), device=flat.device).repeat_interleave(n)
         support = _own_numbers(support, copy, n, len(scene.static_bodies), len(scene.planes), leading.numel())
     shape = poses.shape[:-2]
     in_static, in_object, gap = (x.reshape(shape).to(poses.dtype) for x in (in_static, in_object, gap))
     return PhysicsReport(in_static, in_object, gap, support.reshape(shape), tuple(scene.labels))
+
+
+def _remembered(scene: Scene) -> bool:
+    from physpose_torch.fused import remembers
+
+    return remembers(scene)
+
+
+def _fused(poses: Tensor, scene: Scene, acts: Tensor, backend: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    from physpose_torch.fused import FusedMeasure
+
+    m = FusedMeasure(scene, acts, poses, reach=REACH)
+    return m.depth_static, m.depth_object, m.height, m.support
+
+
+def _measure(poses: Tensor, scene: Scene, acts: Tensor, backend: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    contacts = find_contacts(poses, scene, acts=acts, backend=backend)
+    depth = (-contacts.distance).clamp_min(0.0)
+    first, second = contacts.pair_first[contacts.pair], contacts.pair_second[contacts.pair]
+    static = second >= len(scene)
+    felt_first, felt_second = contacts.moves_first[contacts.pair], contacts.moves_second[contacts.pair]
+    in_static, in_object = poses.new_zeros(len(scene)), poses.new_zeros(len(scene))
+    in_static = in_static.scatter_reduce(0, first[static], depth[static], "amax")
+    for who, felt in ((first, felt_first), (second, felt_second)):
+        among = ~static & felt
+        in_object = in_object.scatter_reduce(0, who[among], depth[among], "amax")
+    drops = find_drops(poses, scene, acts=acts, reach=REACH, backend=backend)
+    return in_static, in_object, drops.height, drops.support
 
 
 def _own_numbers(support: Tensor, copy: Tensor, n: int, bodies: int, planes: int, copies: int) -> Tensor:

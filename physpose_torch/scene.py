@@ -263,10 +263,13 @@ class Scene:
         return _stack([b.center for b in self._packing.number], (0, 3))[self._entity_body[: len(self)]]
 
     @cached_property
-    def object_radius(self) -> Tensor:
-        """(N,) radius of each object about :attr:`object_center` [m]."""
-        radius = torch.tensor([b.radius for b in self._packing.number], dtype=torch.float64)
-        return radius[self._entity_body[: len(self)]]
+    def entity_span(self) -> Tensor:
+        """(N + S,) largest distance of a point of each entity's parts from the origin of its frame [m]."""
+        if not len(self.entity_image):
+            return torch.zeros(0, dtype=torch.float64)
+        length = torch.linalg.vector_norm(self.parts.padded.double(), dim=-1).amax(1)
+        span = torch.zeros(len(self.entity_image), dtype=torch.float64)
+        return span.scatter_reduce(0, self.instance_entity, length[self.instance_part], "amax")
 
     @cached_property
     def entity_pairs(self) -> Tensor:

@@ -31,10 +31,11 @@ def _point_triangle(P, V, F):
     a, b, c = (V[F[:, i]][None] for i in range(3))
     p = P[:, None]
     n = np.cross(b - a, c - a)
-    n = n / np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-300)
+    area = np.linalg.norm(n, axis=-1)
+    n = n / np.maximum(area, 1e-300)[..., None]
     height = ((p - a) * n).sum(-1, keepdims=True)
     q = p - height * n
-    inside = np.ones(q.shape[:2], bool)
+    inside = np.broadcast_to(area > 1e-300, q.shape[:2]).copy()  # one without area is left to its edges
     for u, v in ((a, b), (b, c), (c, a)):
         inside &= (np.cross(v - u, q - u) * n).sum(-1) >= 0
     best = np.where(inside, np.abs(height[..., 0]), np.inf)
@@ -53,8 +54,8 @@ def _segment_segment(P0, P1, Q0, Q1):
     best = (np.inf, None, None)
     zero, one = np.zeros_like(s), np.ones_like(s)
     for s_ in (s, zero, one):
-        t = np.clip((b * s_ + f) / e, 0, 1)
-        s2 = np.clip((b * t - c) / a, 0, 1)
+        t = np.clip((b * s_ + f) / np.maximum(e, 1e-300), 0, 1)  # edges may have no length
+        s2 = np.clip((b * t - c) / np.maximum(a, 1e-300), 0, 1)
         for ss, tt in ((s2, t), (s_, t)):
             x, y = P0[:, None] + ss[..., None] * d1, Q0[None] + tt[..., None] * d2
             gap = np.linalg.norm(x - y, axis=-1)

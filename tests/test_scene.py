@@ -141,7 +141,7 @@ def test_what_is_made_of_a_scene_shares_its_parts(mixed, table, box, angle):
     vertices = [[scene.parts.part(p)[0] for p in scene.instance_part.tolist()] for scene in (few, alone)]
     assert all(torch.equal(a, b) for a, b in zip(*vertices, strict=True))
     assert torch.equal(few.object_center, alone.object_center)
-    assert torch.equal(few.object_radius, alone.object_radius)
+    assert torch.equal(few.entity_span, alone.entity_span)
     other = Scene.tabletop([angle, box], table.plane)
     whole = Scene.cat([mixed, other])
     assert whole.parts.n_bodies == mixed.parts.n_bodies == 3

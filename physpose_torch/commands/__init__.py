@@ -16,7 +16,7 @@ from physpose_torch.errors import InvalidInputError
 __all__ = ["parse"]
 
 COMMANDS = {"demo": Demo, "refine": Refine, "eval": Eval, "decompose": Decompose}
-PRESETS = {"default": RefinerConfig, "paper": RefinerConfig.paper}
+PRESETS = {"default": RefinerConfig, "lm": RefinerConfig.lm, "paper": RefinerConfig.paper}
 
 
 def parse(args: Sequence[str]) -> Any:

@@ -56,7 +56,7 @@ class Refine:
     targets: Path | None = None
     """Targets file: how many instances of each object an image has. Default: the dataset's, if there."""
     preset: str = "default"
-    """default, or paper: the paper's cost, weights and plain gradient descent."""
+    """default; lm: the same cost by ten Gauss-Newton steps; or paper: the paper's cost, weights and plain gradient descent."""
     config: RefinerConfig = field(default_factory=RefinerConfig)
     """Single options, starting from the preset."""
     scenes: tuple[int, ...] = ()

@@ -55,11 +55,7 @@ def signed_distance(
         InvalidInputError: shapes do not match, or the backend is unknown.
         MissingExtraError: no distance backend is installed.
     """
-    if pairs.ndim != 2 or pairs.shape[1] != 2 or T_a.shape != (len(pairs), 4, 4) or T_b.shape != T_a.shape:
-        raise InvalidInputError(
-            f"T_a {tuple(T_a.shape)}, T_b {tuple(T_b.shape)}, pairs {tuple(pairs.shape)}: "
-            "expected (E, 4, 4), (E, 4, 4) and (E, 2)"
-        )
+    T_a, T_b, pairs = _checked(T_a, T_b, parts, pairs)
     with torch.autocast(T_a.device.type, enabled=False):  # a micrometre is lost in half precision
         if chosen_backend(backend) == "warp" and _fused(smoothing):
             from physpose_torch.distance.warp import warp_distance
@@ -94,6 +90,11 @@ def drop_distance(
         distance: (E,) [m], 0 where they already touch or overlap, infinite where they never meet; normal and witness
         points are those at the meeting point, a's before the fall.
     """
+    T_a, T_b, pairs = _checked(T_a, T_b, parts, pairs)
+    if gravity.shape != (len(pairs), 3):
+        raise InvalidInputError(
+            f"gravity has shape {tuple(gravity.shape)}, expected ({len(pairs)}, 3): one for each pair"
+        )
     if chosen_backend(backend) == "warp" and _fused(smoothing):
         from physpose_torch.distance.warp import warp_drop
 
@@ -187,6 +188,26 @@ def _backend(name: str) -> Backend:
     from physpose_torch.distance.warp import warp_query
 
     return warp_query
+
+
+def _checked(T_a: Tensor, T_b: Tensor, parts: ConvexParts, pairs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Poses in one dtype that distances are computed in, and pairs as long; kernels check nothing."""
+    if pairs.ndim != 2 or pairs.shape[1] != 2 or T_a.shape != (len(pairs), 4, 4) or T_b.shape != T_a.shape:
+        raise InvalidInputError(
+            f"T_a {tuple(T_a.shape)}, T_b {tuple(T_b.shape)}, pairs {tuple(pairs.shape)}: "
+            "expected (E, 4, 4), (E, 4, 4) and (E, 2)"
+        )
+    if pairs.is_floating_point() or pairs.dtype == torch.bool:
+        raise InvalidInputError(f"pairs have dtype {pairs.dtype}, expected long: indices of parts")
+    # a device is not asked: it would have to be waited for
+    if pairs.device.type == "cpu" and not torch.compiler.is_compiling() and len(pairs):
+        least, most = int(pairs.min()), int(pairs.max())
+        if least < 0 or most >= parts.n_parts:
+            raise InvalidInputError(
+                f"pairs name part {least if least < 0 else most}, but there are {parts.n_parts} parts"
+            )
+    dtype = torch.promote_types(torch.promote_types(T_a.dtype, T_b.dtype), torch.float32)
+    return T_a.to(dtype), T_b.to(dtype), pairs.long()
 
 
 def _query(run: Backend, T_a: Tensor, T_b: Tensor, parts: ConvexParts, pairs: Tensor) -> tuple[Tensor, ...]:

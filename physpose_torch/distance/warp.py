@@ -100,6 +100,7 @@ def parts_struct(parts: ConvexParts, dtype: torch.dtype, device: torch.device) -
     """The parts as the kernels read them, made once for each set, dtype and device."""
     structs = _structs.setdefault(parts, {})
     if (dtype, device) not in structs:
+        parts = parts.reference  # rounded once, at the end
         s = shapes(REAL[dtype])
         facets, half = parts.facets, 0.5 * (parts.upper - parts.lower)
         lanes, lane_start = _lanes(parts)
@@ -115,6 +116,7 @@ def parts_struct(parts: ConvexParts, dtype: torch.dtype, device: torch.device) -
             "edge_start": (facets.edge_start, None),
             "center": (parts.center, s.vec3),
             "half": (half, s.vec3),
+            "middle": ((parts.padded * parts.padded_mask[:, :, None]).sum(1) / parts.vertex_count[:, None], s.vec3),
         }
         structs[dtype, device] = fill(s.Parts(), fields, dtype, device)
     return structs[dtype, device]
@@ -149,7 +151,9 @@ def wobble_struct(smoothing: Smoothing | None, dtype: torch.dtype, device: torch
     s, out = shapes(REAL[dtype]), smooth(REAL[dtype]).Wobble()
     if smoothing is not None:
         nodes, share = smoothing_nodes(smoothing)
-        out.noise, out.tangential, out.blur = smoothing.noise, int(smoothing.kind == "ring"), CONTACT_BLUR
+        out.noise, out.tangential = smoothing.noise, int(smoothing.kind == "ring")
+        # in float32 thinner spreads than this are lost beside long ones
+        out.blur = CONTACT_BLUR if dtype == torch.float64 else 10 * CONTACT_BLUR
         out.reach = float(torch.linalg.vector_norm(nodes, dim=1).max())
     return fill(out, {"nodes": (nodes, s.vec3), "share": (share, None)}, dtype, device)
 
@@ -266,8 +270,17 @@ def warp_drop(
     smoothing: Smoothing | None,
 ) -> DistanceResult:
     """See :func:`physpose_torch.distance.autograd.drop_distance`; computed in the poses' dtype and on their device."""
-    arguments = (pairs.to(T_a.device), parts.handle, *_plain(smoothing), gravity.to(T_a), limit)
-    return DistanceResult(*_Distance.apply(T_a, T_b, _drop_distance, *arguments))
+    gravity = gravity.to(T_a)
+    arguments = (pairs.to(T_a.device), parts.handle, *_plain(smoothing), gravity, limit)
+    out = DistanceResult(*_Distance.apply(T_a, T_b, _drop_distance, *arguments))
+    if not gravity.requires_grad:
+        return out
+    # h = gap / (n·g), so ∂h/∂g = -h n / (n·g)
+    rate = (out.normal * gravity.detach()).sum(-1)
+    height = out.distance.detach()
+    slope = torch.where(height.isfinite() & (rate > 0), -height / rate.clamp_min(1e-300), 0.0)[:, None] * out.normal
+    linear = (slope * gravity).sum(-1)
+    return out._replace(distance=out.distance + (linear - linear.detach()))
 
 
 def _plain(smoothing: Smoothing | None) -> tuple[str, float, int, int]:

@@ -10,6 +10,7 @@ from torch import Tensor
 from physpose_torch.config import RefinerConfig
 from physpose_torch.contacts import object_heights
 from physpose_torch.distance.autograd import chosen_backend
+from physpose_torch.errors import InvalidInputError
 from physpose_torch.losses import PhysicsTerms
 from physpose_torch.prior import PosePrior
 from physpose_torch.scene import Scene
@@ -18,7 +19,7 @@ from physpose_torch.solvers.general import GeneralCost
 if TYPE_CHECKING:
     from physpose_torch.fused import FusedCost
 
-__all__ = ["Descent", "descend", "make_cost", "out_of_planes"]
+__all__ = ["Descent", "descend", "iterate", "make_cost", "out_of_planes", "start"]
 
 ADAM_BETAS = (0.8, 0.95)
 """Short memories: contacts come and go within a few steps."""
@@ -31,6 +32,8 @@ ADAM_EPS = 0.1
 class Descent(NamedTuple):
     poses: Tensor
     """(N, 4, 4)."""
+    terms: PhysicsTerms
+    """(N,) each, costs at the poses."""
     steps: Tensor
     """(I,) steps that each image took."""
     converged: Tensor
@@ -59,9 +62,7 @@ def descend(
         config: optimizer options.
         callback: called with step, poses (N, 4, 4) and terms of the images still running before each step.
     """
-    poses = out_of_planes(prior, scene) if config.start == "slide" else prior.measured.clone()
-    scale = _principal_scale(prior) if config.optimizer == "adam" else torch.eye(6).to(poses).expand(len(scene), 6, 6)
-    cost = make_cost(prior, scene, acts, config, poses, scale)
+    cost = start(prior, scene, acts, config)
     x = cost.step.requires_grad_()
     if config.optimizer == "adam":
         optimizer = torch.optim.Adam([x], lr=config.learning_rate, betas=ADAM_BETAS, eps=ADAM_EPS, fused=True)
@@ -72,6 +73,33 @@ def descend(
         schedule = torch.optim.lr_scheduler.LambdaLR(
             optimizer, lambda k: 0.5 * (1 + math.cos(math.pi * k / config.steps))
         )
+
+    def advance() -> None:
+        x.grad = cost.gradient
+        optimizer.step()
+        if schedule is not None:
+            schedule.step()
+
+    return iterate(cost, advance, prior, scene, config, callback)
+
+
+def start(prior: PosePrior, scene: Scene, acts: Tensor, config: RefinerConfig) -> "GeneralCost | FusedCost":
+    """The cost where the iteration begins."""
+    poses = out_of_planes(prior, scene) if config.start == "slide" else prior.measured.clone()
+    scaled = config.solver == "lm" or config.optimizer == "adam"
+    scale = _principal_scale(prior) if scaled else torch.eye(6).to(poses).expand(len(scene), 6, 6)
+    return make_cost(prior, scene, acts, config, poses, scale)
+
+
+def iterate(
+    cost: "GeneralCost | FusedCost",
+    advance: Callable[[], None],
+    prior: PosePrior,
+    scene: Scene,
+    config: RefinerConfig,
+    callback: Callable[[int, Tensor, PhysicsTerms], None] | None,
+) -> Descent:
+    """Evaluate, let ``advance`` set the cost's step, move; until all images are done or the steps are used up."""
     trajectory = [prior.measured.clone()] if config.keep_trajectory else None
     watch = _Watch(cost)
     for step in range(config.steps):
@@ -79,12 +107,9 @@ def descend(
         if watch.all_done():
             break
         if callback is not None:
-            rows = (~cost.done[scene.image.to(cost.done.device)]).nonzero()[:, 0].to(poses.device)
+            rows = (~cost.done[scene.image.to(cost.done.device)]).nonzero()[:, 0].to(cost.poses.device)
             callback(step, cost.poses[rows], cost.terms(rows))
-        x.grad = cost.gradient
-        optimizer.step()
-        if schedule is not None:
-            schedule.step()
+        advance()
         cost.move()
         if trajectory is not None:
             trajectory.append(cost.poses.clone())
@@ -92,7 +117,8 @@ def descend(
         cost.evaluate(config.steps)  # who came to rest in the last step
     done = cost.done.cpu()
     steps = torch.where(done, cost.steps.cpu(), config.steps)
-    return Descent(cost.poses.clone(), steps, done, torch.stack(trajectory) if trajectory is not None else None)
+    terms = PhysicsTerms(*(x.clone() for x in cost.all_terms()))
+    return Descent(cost.poses.clone(), terms, steps, done, torch.stack(trajectory) if trajectory is not None else None)
 
 
 def make_cost(
@@ -102,8 +128,12 @@ def make_cost(
     if chosen_backend(config.physics.backend) == "warp":
         from physpose_torch.fused import FusedCost
 
-        if FusedCost.fits(config):
+        if FusedCost.fits(config, scene):
             return FusedCost(prior, scene, acts, config, poses, scale)
+    if config.solver == "lm":
+        raise InvalidInputError(
+            "solver 'lm' needs the warp backend, gravity='support' and smoothing ring, gaussian or none"
+        )
     return GeneralCost(prior, scene, acts, config, poses, scale)
 
 
@@ -154,6 +184,9 @@ def _principal_scale(prior: PosePrior) -> Tensor:
     covariance[:, :3, :3] += prior.sigma_common**2 * prior.ray[:, :, None] * prior.ray[:, None, :]
     scale = torch.zeros_like(covariance)
     for block in (slice(0, 3), slice(3, 6)):
-        variance, axes = torch.linalg.eigh(covariance[:, block, block])
+        part = covariance[:, block, block]
+        # equal variances leave their axes to rounding, and Adam's steps depend on them
+        tie = torch.arange(3.0).diag().to(part) * part.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None]
+        variance, axes = torch.linalg.eigh(part + 1e-6 * tie)
         scale[:, block, block] = axes * variance.clamp_min(0).sqrt()[:, None]
     return scale

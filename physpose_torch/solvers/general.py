@@ -29,7 +29,7 @@ class GeneralCost:
             torch.bincount(scene.image, minlength=scene.n_images) == 0
         )  # nothing in an empty image: nothing to do
         self.steps = torch.zeros(scene.n_images, dtype=torch.long)
-        self._radius = scene.object_radius.to(poses)
+        self._span = scene.entity_span[: len(scene)].to(poses)
         self._still = torch.zeros(scene.n_images, dtype=torch.long)
         self._farthest = torch.full((scene.n_images,), torch.inf, dtype=poses.dtype)
         self._select()
@@ -37,6 +37,15 @@ class GeneralCost:
     def terms(self, rows: Tensor) -> PhysicsTerms:
         """Costs of the objects of images that are still running, which ``rows`` must be."""
         return self._terms
+
+    def all_terms(self) -> PhysicsTerms:
+        """Costs of all objects at the current poses."""
+        w = self._config.physics
+        with torch.no_grad():
+            pose = prior_loss(self.poses, self._prior)
+            collision, share, gravity = physics_terms(self.poses, self._scene, self._acts, w)
+        total = w.pose_weight * pose + w.collision_weight * share + w.gravity_weight * gravity
+        return PhysicsTerms(pose, collision, gravity, total)
 
     def evaluate(self, step: int) -> None:
         """Costs and gradient at the current poses; images that have come to rest are finished first."""
@@ -66,7 +75,7 @@ class GeneralCost:
         with torch.no_grad():
             move = (self._scale[rows] @ self.step[rows, :, None])[:, :, 0]
             self.step.zero_()
-            reach = move[:, :3].norm(dim=1) + move[:, 3:].norm(dim=1) * self._radius[rows]
+            reach = move[:, :3].norm(dim=1) + move[:, 3:].norm(dim=1) * self._span[rows]
             shorten = (self._config.max_step / reach.clamp_min(self._config.max_step))[:, None]
             self.poses = self.poses.index_copy(0, rows, se3.retract(self.poses[rows], move * shorten))
         zero = torch.zeros(self._scene.n_images, dtype=reach.dtype)

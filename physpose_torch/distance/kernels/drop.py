@@ -145,13 +145,24 @@ def drop(real: type) -> SimpleNamespace:
                 s0 = turn(c3.x, c0.x, gravity)
                 s1 = turn(c3.x, c1.x, gravity)
                 s2 = turn(c3.x, c2.x, gravity)
-                # of the three triangles at c3 the one that the ray is farthest inside
+                # of the three triangles at c3 one that the ray goes through; through an edge, it goes through two, and the
+                # smaller one may be none, seen along the ray
                 m0 = wp.min(s0, -s1)
                 m1 = wp.min(s1, -s2)
                 m2 = wp.min(s2, -s0)
-                if m0 >= m1 and m0 >= m2:
+                least = wp.min(wp.max(wp.max(m0, m1), m2), slack)
+                area0 = real(-1.0)
+                area1 = real(-1.0)
+                area2 = real(-1.0)
+                if m0 >= least:
+                    area0 = turn(c0.x, c1.x, gravity) - s1 + s0
+                if m1 >= least:
+                    area1 = turn(c1.x, c2.x, gravity) - s2 + s1
+                if m2 >= least:
+                    area2 = turn(c2.x, c0.x, gravity) - s0 + s2
+                if area0 >= area1 and area0 >= area2:
                     c2 = c3
-                elif m1 >= m2:
+                elif area1 >= area2:
                     c0 = c3
                 else:
                     c1 = c3

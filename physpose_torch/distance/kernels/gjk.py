@@ -21,6 +21,7 @@ def gjk(real: type) -> SimpleNamespace:
     vec4 = wp.types.vector(4, real)
     mat43 = wp.types.matrix((4, 3), real)
     tolerance = real(1e-12 if real is wp.float64 else 0.0)
+    zero = real(0.0)
     rounding = real(1e-15 if real is wp.float64 else 1e-6)
 
     @wp.struct
@@ -89,7 +90,7 @@ def gjk(real: type) -> SimpleNamespace:
                 if u > real(0.0) and v > real(0.0) and u + v < square:
                     u = u / square
                     v = v / square
-                    r = o + u * along + v * (q - o)
+                    r = (wp.dot(normal, o) / square) * normal  # more exact than from the weights
                     d = wp.dot(r, r)
                     if d < best:
                         best = d
@@ -131,10 +132,11 @@ def gjk(real: type) -> SimpleNamespace:
         return out
 
     @wp.func
-    def closest(parts: Parts, pair: Pair, start: vec3, enough: real):
+    def closest(parts: Parts, pair: Pair, start: vec3, enough: real, thorough: wp.int32):
         """Closest points of a pair, from a first guess of the normal.
 
-        Stops early when a direction shows a gap of at least half the distance and more than ``enough``.
+        Stops early when a direction shows a gap of at least half the distance and more than ``enough``; a ``thorough`` search
+        otherwise goes on until rounding stops it.
 
         ``status``: APART: known to rounding, or ``gap`` > ``enough``. INSIDE: B - A seems to hold the origin. UNSURE:
         rounding stopped the iteration.
@@ -151,17 +153,18 @@ def gjk(real: type) -> SimpleNamespace:
         out.gap = wp.dot(start, x.nearest)
         out.status = UNSURE
         accuracy = wp.max(tolerance, rounding * wp.length(x.nearest))
+        if thorough == 1:
+            accuracy = zero
         for _ in range(STEPS):
             length = wp.length(x.nearest)
             out.length = length
+            if length <= accuracy:
+                break
             if length - out.gap <= accuracy:
-                if length > accuracy:
-                    out.status = APART
+                out.status = APART
                 break
             if out.gap > enough and real(2.0) * out.gap >= length:
                 out.status = APART
-                break
-            if length <= accuracy:
                 break
             direction = x.nearest / length
             a = farthest(parts, pair.a, direction)

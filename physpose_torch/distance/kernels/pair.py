@@ -11,8 +11,10 @@ from physpose_torch.distance.kernels.sat import sat
 from physpose_torch.distance.kernels.shapes import shapes
 from physpose_torch.distance.kernels.smooth import smooth
 
-__all__ = ["pairs"]
+__all__ = ["OPTIONS", "pairs"]
 
+OPTIONS = {"enable_backward": False, "max_unroll": 1, "cpu_compiler_flags": "-march=native"}
+"""Of Warp modules: what adjoints, unrolled loops and inlining without end gain, they lose in time to compile."""
 PULL = 2e-3
 """[m]; parts that overlap are pulled this far apart along their normal to find their witness points."""
 CONTACT = 1e-9
@@ -36,8 +38,9 @@ def pairs(real: type) -> SimpleNamespace:
     closest, separating_axis, fall = gjk(real).closest, sat(real).separating_axis, drop(real).fall
     Wobble, Points, smoothed = m.Wobble, m.Points, m.smoothed
     module = wp.get_module(f"physpose_torch.{real.__name__}")
+    module.options |= OPTIONS
     never = real(float("inf"))
-    one, gap_along = real(1.0), s.gap_along
+    gap_along = s.gap_along
     touching = real(1e-12 if real is wp.float64 else 1e-6)
     arrived = real(CONTACT if real is wp.float64 else 1e-7)
 
@@ -73,12 +76,13 @@ def pairs(real: type) -> SimpleNamespace:
         points of parts that overlap cost another search; they are left out unless asked for.
         """
         out = Distance()
-        out.value = one
         start = hint
-        status = int(INSIDE)
         gap = gap_along(parts, pair, hint)
+        status = int(INSIDE)
+        seen_apart = int(0)
         if overlapping == 0 or gap > touching:
-            near = closest(parts, pair, hint, enough)
+            near = closest(parts, pair, hint, enough, 0)
+            seen_apart = 1
             status = near.status
             gap = near.gap
             start = near.normal
@@ -90,26 +94,27 @@ def pairs(real: type) -> SimpleNamespace:
             out.b = near.b
         if status != APART:
             axis = separating_axis(parts, pair, gap, start)
-            if overlapping == 1 and axis.gap > touching and out.value == one:
-                # not any more
-                near = closest(parts, pair, axis.normal, enough)
-                out.value = near.length
-                if near.gap > enough:
-                    out.value = near.gap
-                out.normal = near.normal
-                out.a = near.a
-                out.b = near.b
-            elif axis.gap <= touching or status == INSIDE:
+            if axis.gap <= touching:
                 # a hair's breadth apart, their nearest features are the ones that face each other along the axis
                 out.value = axis.gap
                 out.normal = axis.normal
                 if witness == 1:
                     pull = (real(PULL) - axis.gap) * axis.normal
-                    facing = closest(parts, moved(parts, pair, pull), axis.normal, never)
+                    facing = closest(parts, moved(parts, pair, pull), axis.normal, never, 1)
                     out.a = facing.a
                     out.b = facing.b - pull
             else:
+                # rounding misled the first search, or there was none; this one starts where they are surely apart
+                near = closest(parts, pair, axis.normal, enough, 1)
                 out.normal = axis.normal
+                if near.gap > axis.gap:
+                    out.normal = near.normal
+                if seen_apart == 0 or near.length < out.value or status == INSIDE:
+                    out.value = near.length
+                    out.a = near.a
+                    out.b = near.b
+                if wp.max(near.gap, axis.gap) > enough:
+                    out.value = wp.max(near.gap, axis.gap)
         return out
 
     @wp.func

@@ -9,9 +9,13 @@ from physpose_torch.distance.kernels.shapes import shapes
 
 __all__ = ["sat"]
 
-REMEMBERED = 256
-"""Faces of A whose culling vertex is kept; at those beyond it is looked for again."""
-DEPTH = 32
+FACES = 256
+"""Faces of A of which it is kept what put them out; at those beyond it is looked for again."""
+REMEMBERED = 64
+"""Points of B that are kept."""
+ROUNDS = 64
+"""Most splits of an arc; it takes one for each vertex that comes foremost along the arc, and a few at most."""
+DEPTH = 24
 """Most halves of an arc that wait their turn."""
 
 
@@ -37,31 +41,41 @@ def sat(real: type) -> SimpleNamespace:
         """
         best = gap
         best_normal = normal
-        seen = wp.zeros(shape=(REMEMBERED,), dtype=wp.int32)
+        # points of B in the frame of A that have put a face of A out; a face is put out by one that is deep enough below
+        deep = wp.zeros(shape=(REMEMBERED,), dtype=vec3)
+        seen = wp.zeros(shape=(FACES,), dtype=wp.int32)
         start_a = parts.normal_start[pair.a]
-        faces_a = parts.normal_start[pair.a + 1] - start_a
-        last = lowest_b(parts, pair, normal)
-        low = point_b(parts, pair, last)
-        for f in range(faces_a):
+        deep[0] = pair.R * parts.middle[pair.b] + pair.t
+        deep[1] = point_b(parts, pair, lowest_b(parts, pair, normal))
+        known = int(2)
+        last = int(1)
+        for f in range(parts.normal_start[pair.a + 1] - start_a):
             n = parts.normals[start_a + f]
-            offset = parts.offsets[start_a + f]
-            if wp.dot(n, low) - offset > best:
-                last = lowest_b(parts, pair, n)
-                low = point_b(parts, pair, last)
-                g = wp.dot(n, low) - offset
-                if g > best:
-                    best = g
-                    best_normal = n
-            if f < REMEMBERED:
+            level = parts.offsets[start_a + f] + best
+            if wp.dot(n, deep[last]) > level:
+                last = 0
+                if wp.dot(n, deep[0]) > level:
+                    last = 1
+                    if wp.dot(n, deep[1]) > level:
+                        low = point_b(parts, pair, lowest_b(parts, pair, n))
+                        g = wp.dot(n, low) - parts.offsets[start_a + f]
+                        if g > best:
+                            best = g
+                            best_normal = n
+                        last = wp.min(known, REMEMBERED - 1)
+                        deep[last] = low
+                        known = known + 1
+            if f < FACES:
                 seen[f] = last
         back = wp.transpose(pair.R)
         high = back * (parts.vertices[farthest(parts, pair.a, best_normal)] - pair.t)
+        center = back * (parts.middle[pair.a] - pair.t)
         for f in range(parts.normal_start[pair.b], parts.normal_start[pair.b + 1]):
             m = parts.normals[f]
-            if wp.dot(m, high) - parts.offsets[f] > best:
+            level = parts.offsets[f] + best
+            if wp.dot(m, high) > level and wp.dot(m, center) > level:
                 direction = -(pair.R * m)
-                a = farthest(parts, pair.a, direction)
-                high = back * (parts.vertices[a] - pair.t)
+                high = back * (parts.vertices[farthest(parts, pair.a, direction)] - pair.t)
                 g = wp.dot(m, high) - parts.offsets[f]
                 if g > best:
                     best = g
@@ -69,63 +83,62 @@ def sat(real: type) -> SimpleNamespace:
         if best <= real(0.0):
             stack_n0 = wp.zeros(shape=(DEPTH,), dtype=vec3)
             stack_n1 = wp.zeros(shape=(DEPTH,), dtype=vec3)
-            stack_v0 = wp.zeros(shape=(DEPTH,), dtype=wp.int32)
-            stack_v1 = wp.zeros(shape=(DEPTH,), dtype=wp.int32)
+            stack_b0 = wp.zeros(shape=(DEPTH,), dtype=vec3)
+            stack_b1 = wp.zeros(shape=(DEPTH,), dtype=vec3)
             for e in range(parts.edge_start[pair.a], parts.edge_start[pair.a + 1]):
                 edge = parts.edges[e]
+                remembered = int(0)
+                if wp.max(edge[2], edge[3]) < FACES and known <= REMEMBERED:
+                    remembered = 1
+                    if seen[edge[2]] == seen[edge[3]]:
+                        continue  # it bounds the whole arc
                 anchor = parts.vertices[pair.first_a + edge[0]]
                 stack_n0[0] = parts.normals[start_a + edge[2]]
                 stack_n1[0] = parts.normals[start_a + edge[3]]
-                waiting = int(1)
-                if wp.max(edge[2], edge[3]) < REMEMBERED:
-                    stack_v0[0] = seen[edge[2]]
-                    stack_v1[0] = seen[edge[3]]
-                    if stack_v0[0] == stack_v1[0]:  # it bounds the whole arc
-                        waiting = 0
+                if remembered == 1:
+                    stack_b0[0] = deep[seen[edge[2]]]
+                    stack_b1[0] = deep[seen[edge[3]]]
                 else:
-                    stack_v0[0] = lowest_b(parts, pair, stack_n0[0])
-                    stack_v1[0] = lowest_b(parts, pair, stack_n1[0])
-                while waiting > 0:
+                    stack_b0[0] = point_b(parts, pair, lowest_b(parts, pair, stack_n0[0]))
+                    stack_b1[0] = point_b(parts, pair, lowest_b(parts, pair, stack_n1[0]))
+                waiting = int(1)
+                rounds = int(0)
+                while waiting > 0 and rounds < ROUNDS:
+                    rounds = rounds + 1
                     waiting = waiting - 1
                     n0 = stack_n0[waiting]
                     n1 = stack_n1[waiting]
-                    v0 = stack_v0[waiting]
-                    v1 = stack_v1[waiting]
-                    p0 = point_b(parts, pair, v0) - anchor
-                    p1 = point_b(parts, pair, v1) - anchor
-                    # n·p0 and n·p1 bound the gap along the arc; each is ≤ best at its own end, and where it is negative at
-                    # both ends of an arc it is greatest at one of them
-                    a0 = wp.dot(n0, p0)
-                    b0 = wp.dot(n1, p0)
-                    a1 = wp.dot(n0, p1)
-                    b1 = wp.dot(n1, p1)
-                    if wp.min(wp.max(a0, b0), wp.max(a1, b1)) > best + negligible:
-                        fall = a1 - a0
-                        rise = b0 - b1
-                        if fall > negligible and rise > negligible and waiting + 2 <= DEPTH:
-                            middle = rise * n0 + fall * n1  # where v0 and v1 are equally far
-                            length = wp.length(middle)
-                            if length > tiny:
-                                middle = middle / length
-                                if wp.dot(middle, p0) > best + negligible:
-                                    v = lowest_b(parts, pair, middle)
-                                    g = wp.dot(middle, point_b(parts, pair, v) - anchor)
+                    b0 = stack_b0[waiting]
+                    b1 = stack_b1[waiting]
+                    # n·(b0 - anchor) and n·(b1 - anchor) bound the gap along the arc; each is ≤ best at its own end, and
+                    # where it is negative at both ends of an arc it is greatest at one of them
+                    rise = wp.dot(n1, b0 - anchor)
+                    fall = wp.dot(n0, b1 - anchor)
+                    if rise > best + negligible and fall > best + negligible and waiting + 2 <= DEPTH:
+                        rise = rise - wp.dot(n1, b1 - anchor)
+                        fall = fall - wp.dot(n0, b0 - anchor)
+                        middle = rise * n0 + fall * n1  # where b0 and b1 are equally far
+                        length = wp.length(middle)
+                        if rise > negligible and fall > negligible and length > tiny:
+                            middle = middle / length
+                            if wp.dot(middle, b0 - anchor) > best + negligible:
+                                low = point_b(parts, pair, lowest_b(parts, pair, middle))
+                                g = wp.dot(middle, low - anchor)
+                                if g > best:
+                                    # slivers have poor normals, whose arcs may leave the edge's own
+                                    g = wp.dot(middle, low - parts.vertices[farthest(parts, pair.a, middle)])
                                     if g > best:
-                                        # slivers have poor normals, whose arcs may leave the edge's own
-                                        a = farthest(parts, pair.a, middle)
-                                        g = g - wp.dot(middle, parts.vertices[a] - anchor)
-                                        if g > best:
-                                            best = g
-                                            best_normal = middle
-                                    stack_n0[waiting] = n0
-                                    stack_n1[waiting] = middle
-                                    stack_v0[waiting] = v0
-                                    stack_v1[waiting] = v
-                                    stack_n0[waiting + 1] = middle
-                                    stack_n1[waiting + 1] = n1
-                                    stack_v0[waiting + 1] = v
-                                    stack_v1[waiting + 1] = v1
-                                    waiting = waiting + 2
+                                        best = g
+                                        best_normal = middle
+                                stack_n0[waiting] = n0
+                                stack_n1[waiting] = middle
+                                stack_b0[waiting] = b0
+                                stack_b1[waiting] = low
+                                stack_n0[waiting + 1] = middle
+                                stack_n1[waiting + 1] = n1
+                                stack_b0[waiting + 1] = low
+                                stack_b1[waiting + 1] = b1
+                                waiting = waiting + 2
         out = Axis()
         out.gap = best
         out.normal = best_normal

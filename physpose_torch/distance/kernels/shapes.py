@@ -56,6 +56,8 @@ def shapes(real: type) -> SimpleNamespace:
         edge_start: wp.array(dtype=wp.int32)
         center: wp.array(dtype=vec3)
         half: wp.array(dtype=vec3)
+        middle: wp.array(dtype=vec3)
+        """A point inside; the centre of the bounds may be outside."""
 
     @wp.struct
     class Pair:

@@ -193,7 +193,10 @@ def smooth(real: type) -> SimpleNamespace:
         suu = on_a.uu + uu
         suv = on_a.uv + uv
         svv = on_a.vv + vv
-        det = suu * svv - suv * suv
+        # of two thin spreads that lie along each other nearly all cancels, and float32 would be left with noise
+        blur = real(2.0) * wobble.blur * wobble.blur
+        thin = wp.max((suu - blur) * (svv - blur) - suv * suv, zero)
+        det = thin + blur * (suu + svv - blur)
         fx = (svv * x - suv * y) / det
         fy = (suu * y - suv * x) / det
         u = vec3(frame[0, 0], frame[0, 1], frame[0, 2])
