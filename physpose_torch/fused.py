@@ -1,6 +1,9 @@
 """The cost and its gradient for all images in a few kernel launches: what the descent evaluates where Warp is at hand."""
 
-from typing import Any
+import functools
+import os
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
 
 import torch
 import warp as wp
@@ -13,15 +16,22 @@ from physpose_torch.losses import PhysicsTerms
 from physpose_torch.prior import PosePrior
 from physpose_torch.scene import Scene
 
-__all__ = ["FusedCost", "FusedMeasure", "remembers"]
+__all__ = ["FusedCost", "FusedMeasure", "Measured", "remembers"]
 
 FAR = 1e30
 MOST_PAIRS = 50_000_000
 """Pairs of parts that a scene may have; each takes 32 bytes."""
+LEAST_ROWS = 64
+"""Fewer rows than this are not worth another thread."""
 STILL_STEPS = 10
 """An image stops after this many steps on end without motion."""
 LM_STILL_STEPS = 2
 """A Gauss-Newton step that moves nothing is nearly proof enough."""
+
+
+@functools.cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(max(os.cpu_count() or 1, 2) - 1, "physpose_torch")
 
 
 def remembers(scene: Scene) -> bool:
@@ -30,21 +40,33 @@ def remembers(scene: Scene) -> bool:
     return int((count[:, 0] * count[:, 1]).sum()) <= MOST_PAIRS
 
 
+class Measured(NamedTuple):
+    """Penetrations, heights and supports of posed objects, see :class:`physpose_torch.report.PhysicsReport`; (N,) each."""
+
+    depth_static: Tensor
+    depth_object: Tensor
+    height: Tensor
+    """Infinite where nothing is within reach."""
+    support: Tensor
+    """Entity, planes last; -1: none."""
+
+
 class _Fused:
     """A scene and its poses as the kernels see them, in place in torch tensors.
 
     Finished images cost nothing: every kernel leaves them out, so the batch is never rebuilt and the host need not know.
     """
 
-    def __init__(self, scene: Scene, acts: Tensor, poses: Tensor, smoothing: Smoothing | None, falls: Tensor) -> None:
+    def __init__(self, scene: Scene, acts: Tensor, poses: Tensor, smoothing: Smoothing | None) -> None:
         self.n, self.n_images = len(scene), scene.n_images
         self.device, self.dtype = poses.device, poses.dtype
+        self._on_cpu = self.device.type == "cpu"
         ready(self.dtype, self.device)
         self._k = cost_kernels(REAL[self.dtype])
         load(self._k.module, self.device)
         self._parts = parts_struct(scene.parts, self.dtype, self.device)
         self._wobble = wobble_struct(smoothing, self.dtype, self.device)
-        self._world = self._make_world(scene, acts, falls)
+        self._world = self._make_world(scene, acts)
         self._tensor: dict[str, Tensor] = {}
 
     @property
@@ -52,26 +74,33 @@ class _Fused:
         """(N, 4, 4) now."""
         return self._tensor["poses"][: self.n]
 
-    def _record(self, options: Any) -> dict[str, Any]:
+    def _record(self, launches: dict[str, tuple[Any, int, list]]) -> dict[str, Any]:
         """The launches, with their arguments worked out once."""
         device = wp.device_from_torch(self.device)
         stream = wp.stream_from_torch(torch.cuda.current_stream(self.device)) if self.device.type == "cuda" else None
         return {
             name: wp.launch(kernel, dim=count, inputs=inputs, device=device, stream=stream, record_cmd=True)
-            for name, (kernel, count, inputs) in self._launches(options).items()
+            for name, (kernel, count, inputs) in launches.items()
             if count
         }
 
     def _launches(self, options: Any) -> dict[str, tuple[Any, int, list]]:
         k, state, world, parts, wobble = self._k, self._state, self._world, self._parts, self._wobble
+        rows = len(self._tensor["clear"])
+        # a launch on the CPU is one thread; every second row is about half of the work
+        stride = self._threads = max(min(torch.get_num_threads(), rows // LEAST_ROWS), 1) if self._on_cpu else 1
+        shares = [len(range(i, rows, stride)) for i in range(stride)]
         return {
             "boxes": (k.boxes, len(self._tensor["moved"]), [parts, world, state]),
             "planes": (k.planes, self.n, [parts, world, state, options, wobble]),
-            "rows": (k.rows, len(self._tensor["clear"]), [parts, world, state, options, wobble]),
+            **{
+                f"rows {i}": (k.rows, n, [parts, world, state, options, wobble, i, stride])
+                for i, n in enumerate(shares)
+            },
             "measure": (k.measure, self.n, [world, state, options]),
         }
 
-    def _make_world(self, scene: Scene, acts: Tensor, falls: Tensor) -> Any:
+    def _make_world(self, scene: Scene, acts: Tensor) -> Any:
         k, n = self._k, self.n
         count = torch.bincount(scene.image, minlength=scene.n_images)
         first, second = scene.entity_pairs.unbind(1)
@@ -94,7 +123,8 @@ class _Fused:
                 "instance_start": (scene.instance_start, None),
                 "instance_part": (scene.instance_part, None),
                 "gravity": (scene.gravity, k.vec3),
-                "falls": (falls.long(), None),
+                "falls": ((scene.gravity != 0).any(-1).long(), None),
+                "grounded": (((scene.gravity != 0).any(-1) & scene.has_static).long(), None),
                 "acts": (acts.long(), None),
                 "image_start": (_starts(count), None),
                 "image_object": (torch.argsort(scene.image, stable=True), None),
@@ -167,36 +197,48 @@ class _Fused:
             setattr(state, name, wrap(tensor, kind))
         return state
 
+    def measure(self, *, reach: float) -> Measured:
+        """Look at the poses as they are, for supports down to ``reach`` [m]."""
+        options = self._k.Options()
+        options.collision_weight = options.gravity_weight = options.softness = 1.0
+        options.reach, options.smooth = reach, -1
+        self._tensor["done"].zero_()
+        self._commands = self._record(_Fused._launches(self, options))
+        self._launch("boxes", "planes")
+        self._launch_rows()
+        self._launch("measure")
+        depth_static, depth_object, height, support = (
+            self._tensor[k].clone() for k in ("depth_static", "depth_object", "height", "support")
+        )
+        return Measured(depth_static, depth_object, torch.where(height <= reach, height, torch.inf), support.long())
+
     def _launch(self, *names: str) -> None:
         for name in names:
             if name in self._commands:
                 self._commands[name].launch()
 
+    def _launch_rows(self) -> None:
+        if self._threads > 1:
+            others = [_pool().submit(self._launch, f"rows {i}") for i in range(1, self._threads)]
+            self._launch("rows 0")
+            for other in others:
+                other.result()
+        else:
+            self._launch("rows 0")
+
 
 class FusedMeasure(_Fused):
-    """Penetrations, heights and supports of posed objects, see :class:`physpose_torch.report.PhysicsReport`.
+    """Measures poses without a cost.
 
     Args:
         scene: the flat scene.
         acts: (N,) bool, see :func:`physpose_torch.losses.acting`.
         poses: (N, 4, 4).
-        reach: [m], how far down supports are looked for.
     """
 
-    def __init__(self, scene: Scene, acts: Tensor, poses: Tensor, *, reach: float) -> None:
-        super().__init__(scene, acts, poses, None, (scene.gravity != 0).any(-1))
-        options = self._k.Options()
-        options.collision_weight = options.gravity_weight = options.softness = 1.0
-        options.reach, options.smooth = reach, -1
+    def __init__(self, scene: Scene, acts: Tensor, poses: Tensor) -> None:
+        super().__init__(scene, acts, poses, None)
         self._state = self._make_state(scene, poses, lm=False)
-        self._commands = self._record(options)
-        self._launch("boxes", "planes", "rows", "measure")
-        self.depth_static, self.depth_object = self._tensor["depth_static"], self._tensor["depth_object"]
-        height = self._tensor["height"]
-        self.height = torch.where(height <= reach, height, torch.inf)
-        """(N,) [m], infinite where nothing is within reach."""
-        self.support = self._tensor["support"].long()
-        """(N,) entity, planes last; -1: none."""
 
 
 class FusedCost(_Fused):
@@ -216,7 +258,7 @@ class FusedCost(_Fused):
     ) -> None:
         physics = self._physics = config.physics
         smoothing = None if physics.smoothing.kind == "none" else physics.smoothing
-        super().__init__(scene, acts, poses, smoothing, (scene.gravity != 0).any(-1) & scene.has_static)
+        super().__init__(scene, acts, poses, smoothing)
         self._prior = self._make_prior(prior, scale)
         lm = config.solver == "lm"
         options = self._k.Options()
@@ -229,7 +271,7 @@ class FusedCost(_Fused):
         options.still_steps = LM_STILL_STEPS if lm else STILL_STEPS
         self._state = self._make_state(scene, poses, lm=lm)
         self.step = torch.zeros(self.n, 6, dtype=self.dtype, device=self.device)
-        self._commands = self._record(options)
+        self._commands = self._record(self._launches(options))
 
     @staticmethod
     def fits(config: RefinerConfig, scene: Scene) -> bool:
@@ -267,11 +309,19 @@ class FusedCost(_Fused):
         self.evaluate(0)
         return self.terms(torch.arange(self.n, device=self.device))
 
+    def settle(self, step: int) -> None:
+        """Finish the images that have come to rest."""
+        if self.n_images:
+            self._commands["priors"].set_param_at_index(3, step)
+        self._launch("priors")
+
     def evaluate(self, step: int) -> None:
         """Costs and gradient at the current poses; images that have come to rest are finished first."""
         if self.n_images:
             self._commands["priors"].set_param_at_index(3, step)
-        self._launch("boxes", "priors", "planes", "rows", "objects")
+        self._launch("boxes", "priors", "planes")
+        self._launch_rows()
+        self._launch("objects")
 
     def newton(self, fraction: float = 1.0) -> None:
         """Set :attr:`step` to a fraction of the damped Gauss-Newton step."""

@@ -49,6 +49,8 @@ def cost_kernels(real: type) -> SimpleNamespace:
         instance_part: wp.array(dtype=wp.int32)
         gravity: wp.array(dtype=vec3)
         falls: wp.array(dtype=wp.int32)
+        grounded: wp.array(dtype=wp.int32)
+        """Whether anything static is known in each image; what rests on nothing known is not pulled together."""
         acts: wp.array(dtype=wp.int32)
         image_start: wp.array(dtype=wp.int32)
         image_object: wp.array(dtype=wp.int32)
@@ -495,9 +497,11 @@ def cost_kernels(real: type) -> SimpleNamespace:
         return fall(parts, make_pair(parts, a, b, back * R_b, back * (t_b - t_a)), back * g)
 
     @wp.kernel(enable_backward=False, module=module)
-    def rows(parts: Parts, world: World, state: State, options: Options, wobble: Wobble):
+    def rows(
+        parts: Parts, world: World, state: State, options: Options, wobble: Wobble, first: wp.int32, stride: wp.int32
+    ):
         """One part of a body against all parts of another: penetrations, and how far each can fall onto the other."""
-        r = wp.tid()
+        r = first + stride * wp.tid()
         pair = world.row_pair[r]
         a = world.pair_first[pair]
         b = world.pair_second[pair]
@@ -595,7 +599,15 @@ def cost_kernels(real: type) -> SimpleNamespace:
             state.slot_clear[slot] = gap + travelled
             if gap < zero:
                 state.slot_clear[slot] = -one
-            if gap < best_a and lands(low, high, low_b, high_b, best_a):
+            # overlapping parts fall no farther; whether one carries the other, their normal says
+            if gap < zero:
+                if limit_a > zero and wp.dot(normal, g) >= support_slope:
+                    best_a = zero
+                    onto_a = j
+                if limit_b > zero and -wp.dot(normal, g) >= support_slope:
+                    best_b = zero
+                    onto_b = j
+            elif gap < best_a and lands(low, high, low_b, high_b, best_a):
                 hit = fall_of(parts, part_a, part_b, R_a, t_a, R_b, t_b, g)
                 if hit.status == HITS:
                     if hit.height > zero:
@@ -605,7 +617,7 @@ def cost_kernels(real: type) -> SimpleNamespace:
                     elif inside == 1 and wp.dot(normal, g) >= support_slope:
                         best_a = zero
                         onto_a = j
-            if gap < best_b and lands(low_b, high_b, low, high, best_b):
+            if gap >= zero and gap < best_b and lands(low_b, high_b, low, high, best_b):
                 hit = fall_of(parts, part_b, part_a, R_b, t_b, R_a, t_a, g)
                 if hit.status == HITS:
                     if hit.height > zero:
@@ -718,7 +730,7 @@ def cost_kernels(real: type) -> SimpleNamespace:
                             weight = two * weight
                         curvature += weight * block
         gravity = zero
-        if height > zero and height <= options.reach and options.gravity_weight > zero and world.falls[image] == 1:
+        if height > zero and height <= options.reach and options.gravity_weight > zero and world.grounded[image] == 1:
             softness = options.softness
             if other < 0:
                 plane = state.plane_best[i]

@@ -10,7 +10,7 @@ from physpose_torch.config import RefinerConfig
 from physpose_torch.errors import InvalidInputError
 from physpose_torch.losses import PhysicsLoss, PhysicsTerms, acting, check_poses, flatten_covariance
 from physpose_torch.prior import make_prior
-from physpose_torch.report import PhysicsReport, physics_report
+from physpose_torch.report import PhysicsReport, report_of
 from physpose_torch.scene import Scene
 from physpose_torch.solvers.descent import descend
 from physpose_torch.solvers.lm import levenberg_marquardt
@@ -113,7 +113,7 @@ class PhysPoseRefiner(nn.Module):
             result = solve(prior, many, acts, self.config, callback)
             refined = result.poses.reshape(measured.shape)
             terms = (x.reshape(measured.shape[:-2]) for x in result.terms)
-            report = physics_report(refined, scene, scores=scores, backend=self.config.physics.backend)
+            report = report_of(refined, scene, many, acts, self.config.physics.backend, result.cost)
         lengths = ("penetration_static", "penetration_object", "gap")
         report = replace(report, **{name: getattr(report, name).to(poses.dtype) for name in lengths})
         images = (*leading, scene.n_images)

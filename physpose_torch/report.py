@@ -1,6 +1,6 @@
 """What a robot would ask of a set of poses: how deep objects are inside each other, how high above their support."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -10,7 +10,7 @@ from physpose_torch.distance.autograd import chosen_backend
 from physpose_torch.losses import acting, check_poses
 from physpose_torch.scene import Scene
 
-__all__ = ["PhysicsReport", "physics_report"]
+__all__ = ["PhysicsReport", "physics_report", "report_of"]
 
 REACH = 1.0
 """[m]; supports farther below than this are not looked for."""
@@ -78,35 +78,47 @@ def physics_report(
         InvalidInputError: shapes, NaN or non-rigid poses.
     """
     poses = check_poses(poses, scene)
-    n = len(scene)
-    leading = poses.shape[:-3]
+    copies = poses.shape[:-3].numel()
     with torch.inference_mode(False), torch.no_grad():
-        flat = poses.detach().clone().double().reshape(-1, 4, 4)
-        many = scene if leading.numel() == 1 else Scene.cat([scene] * leading.numel())
-        acts = acting(scene, scores).repeat(leading.numel())
-        fused = chosen_backend(backend) == "warp" and _remembered(many)
-        in_static, in_object, height, support = (_fused if fused else _measure)(flat, many, acts, backend)
-        falls = (many.gravity != 0).any(-1)[many.image].to(flat.device)
-        gap = torch.where(falls, height, torch.nan)
-        support = torch.where(falls, support, -1)
-        copy = torch.arange(leading.numel(), device=flat.device).repeat_interleave(n)
-        support = _own_numbers(support, copy, n, len(scene.static_bodies), len(scene.planes), leading.numel())
+        flat = poses.detach().clone().double()
+        many = scene if copies == 1 else Scene.cat([scene] * copies)
+        report = report_of(flat, scene, many, acting(scene, scores).repeat(copies), backend)
+    lengths = ("penetration_static", "penetration_object", "gap")
+    return replace(report, **{name: getattr(report, name).to(poses.dtype) for name in lengths})
+
+
+def report_of(
+    poses: Tensor, scene: Scene, many: Scene, acts: Tensor, backend: str, cost: object | None = None
+) -> PhysicsReport:
+    """The report of checked float64 poses (..., N, 4, 4).
+
+    Args:
+        scene: the scene; many: as many of it in one as there are poses.
+        acts: (M,) bool, which of the objects in ``many`` act.
+        cost: a :class:`~physpose_torch.fused.FusedCost` at these poses, which knows most of it already.
+    """
+    flat, n, copies = poses.reshape(-1, 4, 4), len(scene), poses.shape[:-3].numel()
+    if hasattr(cost, "measure"):
+        measured = cost.measure(reach=REACH)
+    elif chosen_backend(backend) == "warp" and _fused().remembers(many):
+        measured = _fused().FusedMeasure(many, acts, flat).measure(reach=REACH)
+    else:
+        measured = _measure(flat, many, acts, backend)
+    in_static, in_object, height, support = measured
+    falls = (many.gravity != 0).any(-1)[many.image].to(flat.device)
+    gap = torch.where(falls, height, torch.nan)
+    support = torch.where(falls, support, -1)
+    copy = torch.arange(copies, device=flat.device).repeat_interleave(n)
+    support = _own_numbers(support, copy, n, len(scene.static_bodies), len(scene.planes), copies)
     shape = poses.shape[:-2]
     in_static, in_object, gap = (x.reshape(shape).to(poses.dtype) for x in (in_static, in_object, gap))
     return PhysicsReport(in_static, in_object, gap, support.reshape(shape), tuple(scene.labels))
 
 
-def _remembered(scene: Scene) -> bool:
-    from physpose_torch.fused import remembers
+def _fused():
+    from physpose_torch import fused  # which imports Warp
 
-    return remembers(scene)
-
-
-def _fused(poses: Tensor, scene: Scene, acts: Tensor, backend: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    from physpose_torch.fused import FusedMeasure
-
-    m = FusedMeasure(scene, acts, poses, reach=REACH)
-    return m.depth_static, m.depth_object, m.height, m.support
+    return fused
 
 
 def _measure(poses: Tensor, scene: Scene, acts: Tensor, backend: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:

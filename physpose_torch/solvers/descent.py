@@ -1,5 +1,6 @@
 """First-order descent on the physics cost with torch.optim, all images at once, each stopped on its own."""
 
+import itertools
 import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
@@ -40,6 +41,8 @@ class Descent(NamedTuple):
     """(I,) bool: it stopped before the step limit."""
     trajectory: Tensor | None
     """(steps + 1, N, 4, 4), from the estimates on."""
+    cost: "GeneralCost | FusedCost"
+    """At the poses."""
 
 
 def descend(
@@ -68,17 +71,15 @@ def descend(
         optimizer = torch.optim.Adam([x], lr=config.learning_rate, betas=ADAM_BETAS, eps=ADAM_EPS, fused=True)
     else:
         optimizer = torch.optim.SGD([x], lr=config.learning_rate, fused=True)
-    schedule = None
-    if config.decay == "cosine" and config.steps:
-        schedule = torch.optim.lr_scheduler.LambdaLR(
-            optimizer, lambda k: 0.5 * (1 + math.cos(math.pi * k / config.steps))
-        )
+    group = optimizer.param_groups[0]
+    taken = itertools.count()
 
     def advance() -> None:
+        # what an LR scheduler would do, which takes as long as the optimizer itself
+        if config.decay == "cosine":
+            group["lr"] = config.learning_rate * 0.5 * (1 + math.cos(math.pi * next(taken) / config.steps))
         x.grad = cost.gradient
         optimizer.step()
-        if schedule is not None:
-            schedule.step()
 
     return iterate(cost, advance, prior, scene, config, callback)
 
@@ -114,11 +115,12 @@ def iterate(
         if trajectory is not None:
             trajectory.append(cost.poses.clone())
     else:
-        cost.evaluate(config.steps)  # who came to rest in the last step
+        cost.settle(config.steps)  # who came to rest in the last step
     done = cost.done.cpu()
     steps = torch.where(done, cost.steps.cpu(), config.steps)
     terms = PhysicsTerms(*(x.clone() for x in cost.all_terms()))
-    return Descent(cost.poses.clone(), terms, steps, done, torch.stack(trajectory) if trajectory is not None else None)
+    trajectory = torch.stack(trajectory) if trajectory is not None else None
+    return Descent(cost.poses.clone(), terms, steps, done, trajectory, cost)
 
 
 def make_cost(

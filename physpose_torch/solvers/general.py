@@ -47,14 +47,18 @@ class GeneralCost:
         total = w.pose_weight * pose + w.collision_weight * share + w.gravity_weight * gravity
         return PhysicsTerms(pose, collision, gravity, total)
 
-    def evaluate(self, step: int) -> None:
-        """Costs and gradient at the current poses; images that have come to rest are finished first."""
+    def settle(self, step: int) -> None:
+        """Finish the images that have come to rest."""
         self._still = torch.where(self._farthest <= self._config.tolerance, self._still + 1, 0)
         finished = ~self.done & (self._still >= STILL_STEPS)
         if bool(finished.any()):
             self.steps[finished] = step
             self.done = self.done | finished
             self._select()
+
+    def evaluate(self, step: int) -> None:
+        """Costs and gradient at the current poses; images that have come to rest are finished first."""
+        self.settle(step)
         w, rows = self._config.physics, self._rows
         leaf = self.poses[rows].requires_grad_()
         pose = prior_loss(leaf, self._active_prior)
