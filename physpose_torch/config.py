@@ -5,7 +5,10 @@ from typing import Literal
 
 from physpose_torch.errors import InvalidInputError
 
-__all__ = ["PhysicsConfig", "RefinerConfig", "Smoothing"]
+__all__ = ["STILL_STEPS", "PhysicsConfig", "RefinerConfig", "Smoothing"]
+
+STILL_STEPS = 10
+"""An image stops after this many steps of a descent on end without motion."""
 
 
 def _check_positive(config: object, *names: str) -> None:

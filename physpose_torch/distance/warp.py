@@ -8,7 +8,7 @@ import contextlib
 import functools
 import logging
 import os
-import time
+import threading
 import weakref
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -44,11 +44,13 @@ __all__ = [
 logger = logging.getLogger("physpose_torch")
 
 REAL = {torch.float32: wp.float32, torch.float64: wp.float64}
+PATIENCE = 1.5
+"""[s]; loading compiled kernels takes less."""
 _structs: "weakref.WeakKeyDictionary[ConvexParts, dict]" = weakref.WeakKeyDictionary()
 
 
 @functools.cache
-def _initialised() -> None:
+def initialise() -> None:
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # no banner, no load times
     with contextlib.nullcontext() if torch.cuda.is_available() else _silent():
         wp.init()
@@ -74,19 +76,30 @@ def _silent() -> Iterator[None]:
 @functools.cache
 def ready(dtype: torch.dtype, device: torch.device) -> SimpleNamespace:
     """Kernels for a dtype, compiled for a device."""
-    _initialised()
+    initialise()
     kernels = pair_kernels(REAL[dtype])
     load(kernels.module, device)
     return kernels
 
 
 def load(module: "wp.Module", device: torch.device) -> None:
-    """Compile a module, or load it from Warp's cache, and say so if that takes long."""
-    start = time.perf_counter()
-    logger.info("loading distance kernels; compiling them, once, takes up to 20 s")
-    if module.load(wp.device_from_torch(device)) is None:
+    """Compile a module, or load it from Warp's cache, and say so if that takes a while.
+
+    Raises:
+        BackendError: it cannot be compiled.
+    """
+    message = "compiling the distance kernels for %s; this happens once and takes up to 20 s"
+    notice = threading.Timer(PATIENCE, logger.warning, (message, device))
+    notice.daemon = True
+    notice.start()
+    try:
+        loaded = module.load(wp.device_from_torch(device))
+    except Exception as error:  # of any kind, a compiler's
+        raise BackendError(f"Warp could not compile the distance kernels for {device}: {error}") from error
+    finally:
+        notice.cancel()
+    if loaded is None:
         raise BackendError(f"Warp could not compile the distance kernels for {device}; use another backend ('fcl')")
-    logger.info("distance kernels loaded in %.1f s", time.perf_counter() - start)
 
 
 def wrap(tensor: Tensor, dtype: Any = None) -> "wp.array":
@@ -160,15 +173,24 @@ def wobble_struct(smoothing: Smoothing | None, dtype: torch.dtype, device: torch
 
 @torch.library.custom_op("physpose_torch::signed_distance", mutates_args=())
 def _signed_distance(
-    T_a: Tensor, T_b: Tensor, pairs: Tensor, parts: int, kind: str, noise: float, samples: int, seed: int
+    T_a: Tensor,
+    T_b: Tensor,
+    gradient: bool,
+    pairs: Tensor,
+    parts: int,
+    kind: str,
+    noise: float,
+    samples: int,
+    seed: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    return _run("signed_distances", T_a, T_b, pairs, parts, _smoothing(kind, noise, samples, seed))
+    return _run("signed_distances", T_a, T_b, gradient, pairs, parts, _smoothing(kind, noise, samples, seed))
 
 
 @torch.library.custom_op("physpose_torch::drop_distance", mutates_args=())
 def _drop_distance(
     T_a: Tensor,
     T_b: Tensor,
+    gradient: bool,
     pairs: Tensor,
     parts: int,
     kind: str,
@@ -179,12 +201,16 @@ def _drop_distance(
     limit: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     gravity = gravity.detach().contiguous()
-    return _run("drop_distances", T_a, T_b, pairs, parts, _smoothing(kind, noise, samples, seed), gravity, limit)
+    return _run(
+        "drop_distances", T_a, T_b, gradient, pairs, parts, _smoothing(kind, noise, samples, seed), gravity, limit
+    )
 
 
-def _run(name: str, T_a, T_b, pairs, parts: int, smoothing: Smoothing | None, *rest) -> tuple[Tensor, ...]:
+def _run(
+    name: str, T_a, T_b, gradient: bool, pairs, parts: int, smoothing: Smoothing | None, *rest
+) -> tuple[Tensor, ...]:
     T_a, T_b, pairs = T_a.detach().contiguous(), T_b.detach().contiguous(), pairs.contiguous()
-    out = _empty(T_a)
+    out = _empty(T_a, gradient)
     if len(pairs) == 0:
         return out
     dtype, device = T_a.dtype, T_a.device
@@ -215,19 +241,14 @@ def _smoothing(kind: str, noise: float, samples: int, seed: int) -> Smoothing | 
     return None if kind == "none" else Smoothing(kind, noise=noise, samples=samples, seed=seed)
 
 
-def _empty(T: Tensor) -> tuple[Tensor, ...]:
-    vector = T.new_zeros(len(T), 3)
-    return (
-        T.new_zeros(len(T)),
-        vector,
-        *(torch.zeros_like(vector) for _ in range(2)),
-        torch.zeros_like(T),
-        torch.zeros_like(T),
-    )
+def _empty(T: Tensor, gradient: bool) -> tuple[Tensor, ...]:
+    """Room for distances, normals, points and, if asked for, gradients."""
+    gradients = (T.new_zeros(len(T) if gradient else 0, 4, 4) for _ in range(2))
+    return T.new_zeros(len(T)), *(T.new_zeros(len(T), 3) for _ in range(3)), *gradients
 
 
-def _fake(T_a: Tensor, *_) -> tuple[Tensor, ...]:
-    return _empty(T_a)
+def _fake(T_a: Tensor, T_b: Tensor, gradient: bool, *_) -> tuple[Tensor, ...]:
+    return _empty(T_a, gradient)
 
 
 for _op in (_signed_distance, _drop_distance):
@@ -239,7 +260,8 @@ class _Distance(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, T_a, T_b, operator, *rest):
-        distance, normal, point_a, point_b, *gradients = operator(T_a, T_b, *rest)
+        wanted = ctx.needs_input_grad[0] or ctx.needs_input_grad[1]
+        distance, normal, point_a, point_b, *gradients = operator(T_a, T_b, wanted, *rest)
         ctx.save_for_backward(*gradients)
         ctx.mark_non_differentiable(normal, point_a, point_b)
         ctx.n_rest = len(rest)

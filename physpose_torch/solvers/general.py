@@ -4,19 +4,16 @@ import torch
 from torch import Tensor
 
 from physpose_torch import se3
-from physpose_torch.config import RefinerConfig
+from physpose_torch.config import STILL_STEPS, RefinerConfig
 from physpose_torch.losses import PhysicsTerms, physics_terms, prior_loss
 from physpose_torch.prior import PosePrior
 from physpose_torch.scene import Scene
 
-__all__ = ["STILL_STEPS", "GeneralCost"]
-
-STILL_STEPS = 10
-"""An image stops after this many steps on end without motion."""
+__all__ = ["GeneralCost"]
 
 
 class GeneralCost:
-    """State of a refinement in flight; the same interface as :class:`physpose_torch.solvers.fused.FusedCost`."""
+    """State of a refinement in flight; the same interface as :class:`physpose_torch.fused.FusedCost`."""
 
     def __init__(
         self, prior: PosePrior, scene: Scene, acts: Tensor, config: RefinerConfig, poses: Tensor, scale: Tensor

@@ -932,7 +932,7 @@ def test_sets_of_parts_do_not_get_mixed_up():
 
 def operator_arguments(dtype, n=5):
     T_a, T_b, pairs = (x[:n] for x in landing())
-    start = (*rounded(T_a, T_b, dtype), pairs, PARTS.handle, "ring", 0.1, 16, 0)
+    start = (*rounded(T_a, T_b, dtype), True, pairs, PARTS.handle, "ring", 0.1, 16, 0)
     return {
         "signed_distance": start,
         "drop_distance": (*start, DOWN.to(dtype).expand(n, 3).contiguous(), 5.0),

@@ -39,6 +39,8 @@ def drop(real: type) -> SimpleNamespace:
         normal: vec3
         a: vec3
         b: vec3
+        aside: real
+        """The ray misses by at least this much; neither part falls onto the other then."""
 
     @wp.func
     def lowest(parts: Parts, pair: Pair, direction: vec3):
@@ -87,6 +89,7 @@ def drop(real: type) -> SimpleNamespace:
         possible = int(1)
         if wp.dot(direction, c1.x) > real(0.0):
             possible = 0
+            out.aside = wp.dot(direction, c1.x) / wp.length(direction)
         if possible == 1:
             direction = wp.cross(gravity, c1.x - c0.x)
             if wp.dot(direction, c0.x) < real(0.0):
@@ -95,7 +98,7 @@ def drop(real: type) -> SimpleNamespace:
             for _ in range(STEPS):
                 # c2 is the farthest across the edge c0 c1, on whose other side the ray is
                 if wp.dot(direction, c2.x) > real(0.0):
-                    possible = 0
+                    out.aside = wp.dot(direction, c2.x) / wp.length(direction)
                     break
                 if turn(c1.x - c0.x, c2.x - c0.x, gravity) < real(0.0):
                     swap = c0

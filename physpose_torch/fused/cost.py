@@ -9,22 +9,20 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from physpose_torch.config import RefinerConfig, Smoothing
-from physpose_torch.distance.warp import REAL, fill, load, parts_struct, ready, wobble_struct, wrap
-from physpose_torch.fused_kernels import cost_kernels
+from physpose_torch.config import STILL_STEPS, RefinerConfig, Smoothing
+from physpose_torch.distance.warp import REAL, initialise, load, parts_struct, wobble_struct, wrap
+from physpose_torch.fused.buffers import FAR, make_prior, make_state, make_world
+from physpose_torch.fused.kernels import cost_kernels
 from physpose_torch.losses import PhysicsTerms
 from physpose_torch.prior import PosePrior
 from physpose_torch.scene import Scene
 
 __all__ = ["FusedCost", "FusedMeasure", "Measured", "remembers"]
 
-FAR = 1e30
 MOST_PAIRS = 50_000_000
-"""Pairs of parts that a scene may have; each takes 32 bytes."""
+"""Pairs of parts that a scene may have; each takes 40 bytes."""
 LEAST_ROWS = 64
 """Fewer rows than this are not worth another thread."""
-STILL_STEPS = 10
-"""An image stops after this many steps on end without motion."""
 LM_STILL_STEPS = 2
 """A Gauss-Newton step that moves nothing is nearly proof enough."""
 
@@ -61,12 +59,12 @@ class _Fused:
         self.n, self.n_images = len(scene), scene.n_images
         self.device, self.dtype = poses.device, poses.dtype
         self._on_cpu = self.device.type == "cpu"
-        ready(self.dtype, self.device)
+        initialise()
         self._k = cost_kernels(REAL[self.dtype])
         load(self._k.module, self.device)
         self._parts = parts_struct(scene.parts, self.dtype, self.device)
         self._wobble = wobble_struct(smoothing, self.dtype, self.device)
-        self._world = self._make_world(scene, acts)
+        self._world = make_world(self._k, scene, acts, self.dtype, self.device)
         self._tensor: dict[str, Tensor] = {}
 
     @property
@@ -99,103 +97,6 @@ class _Fused:
             },
             "measure": (k.measure, self.n, [world, state, options]),
         }
-
-    def _make_world(self, scene: Scene, acts: Tensor) -> Any:
-        k, n = self._k, self.n
-        count = torch.bincount(scene.image, minlength=scene.n_images)
-        first, second = scene.entity_pairs.unbind(1)
-        felt = (second >= n) | acts[first] | acts[second.clamp_max(max(n - 1, 0))] if n else second >= n
-        first, second = first[felt], second[felt]
-        rows = scene.instance_start.diff()[first]
-        pair = torch.arange(len(first))
-        row_pair = torch.repeat_interleave(pair, rows)
-        start = _starts(rows)
-        slots = scene.instance_start.diff()[second[row_pair]]
-        movable = second < n
-        ends, sides = torch.cat([first, second[movable]]), torch.cat([pair, pair[movable]])
-        planes = scene.plane_pairs
-        world = k.World()
-        world.n_objects = n
-        return fill(
-            world,
-            {
-                "image": (scene.entity_image, None),
-                "instance_start": (scene.instance_start, None),
-                "instance_part": (scene.instance_part, None),
-                "gravity": (scene.gravity, k.vec3),
-                "falls": ((scene.gravity != 0).any(-1).long(), None),
-                "grounded": (((scene.gravity != 0).any(-1) & scene.has_static).long(), None),
-                "acts": (acts.long(), None),
-                "image_start": (_starts(count), None),
-                "image_object": (torch.argsort(scene.image, stable=True), None),
-                "pair_first": (first, None),
-                "pair_second": (second, None),
-                "pair_row": (start, None),
-                "row_pair": (row_pair, None),
-                "row_instance": (
-                    scene.instance_start[first[row_pair]] + torch.arange(len(row_pair)) - start[row_pair],
-                    None,
-                ),
-                "row_slot": (_starts(slots), None),
-                "object_pair_start": (_starts(torch.bincount(ends, minlength=n)), None),
-                "object_pair": (sides[torch.argsort(ends, stable=True)], None),
-                "object_plane_start": (_starts(torch.bincount(planes[:, 0], minlength=n)), None),
-                "object_plane": (planes[torch.argsort(planes[:, 0], stable=True), 1], None),
-                "plane_normal": (scene.plane_normal, k.vec3),
-                "plane_offset": (scene.plane_offset, None),
-                "plane_covariance": (scene.plane_covariance, k.mat33),
-                "center": (scene.object_center, k.vec3),
-                "span": (scene.entity_span, None),
-            },
-            self.dtype,
-            self.device,
-        )
-
-    def _make_state(self, scene: Scene, poses: Tensor, *, lm: bool) -> Any:
-        k, n, images = self._k, self.n, scene.n_images
-        entities, instances = len(scene.entity_image), len(scene.instance_entity)
-        rows, slots = len(self._world._tensors["row_pair"]), int(self._world._tensors["row_slot"][-1])
-        real = {"dtype": self.dtype, "device": self.device}
-        whole = {"dtype": torch.int32, "device": self.device}
-        empty = torch.bincount(scene.image, minlength=images) == 0  # nothing to do
-        shapes = {
-            **dict.fromkeys(("lower", "upper"), (instances, 3)),
-            **dict.fromkeys(("entity_lower", "entity_upper"), (entities, 3)),
-            "moved": (entities,),
-            "middle": (images, 3),
-            **dict.fromkeys(
-                ("farthest", "pose", "plane_cost", "plane_depth", "plane_height", "collision", "share", "gravity"), (n,)
-            ),
-            **dict.fromkeys(("depth_static", "depth_object", "height"), (n,)),
-            **dict.fromkeys(("pose_slope", "follow_gradient", "follow_follow"), (n,)),
-            **dict.fromkeys(("newton", "follow"), (n, 6)),
-            "information": (images,),
-            "plane_curvature": (n if lm else 0, 6, 6),
-            **dict.fromkeys(("row_curvature_a", "row_curvature_b"), (rows if lm else 0, 6, 6)),
-            **dict.fromkeys(("pose_gradient", "plane_gradient", "gradient"), (n, 6)),
-            **dict.fromkeys(("row_cost", "row_depth", "row_drop_a", "row_drop_b"), (rows,)),
-            **dict.fromkeys(("row_force", "row_torque_a", "row_torque_b"), (rows, 3)),
-        }
-        counters = {
-            "still": images,
-            **dict.fromkeys(("plane_best", "plane_instance", "support"), n),
-            **dict.fromkeys(("row_count", "row_onto_a", "row_onto_b"), rows),
-        }
-        self._tensor = {name: torch.zeros(shape, **real) for name, shape in shapes.items()}
-        self._tensor |= {name: torch.zeros(size, **whole) for name, size in counters.items()}
-        self._tensor["poses"] = scene.entity_poses(poses).detach().to(**real).clone().contiguous()
-        self._tensor["clear"] = torch.full((rows,), -FAR, **real)
-        self._tensor["slot_clear"] = torch.full((slots,), -FAR, **real)
-        self._tensor["slot_normal"] = torch.zeros(slots, 3, **real)
-        self._tensor["farthest"].fill_(FAR)  # nothing is at rest before it has moved
-        self._tensor["done"] = empty.to(**whole)
-        self._tensor["steps"] = torch.zeros(images, **whole)
-        kinds = {(3,): k.vec3, (6,): k.vec6, (4, 4): k.mat44, (6, 6): k.mat66}
-        state = k.State()
-        for name, tensor in self._tensor.items():
-            kind = kinds.get(tuple(tensor.shape[1:]))
-            setattr(state, name, wrap(tensor, kind))
-        return state
 
     def measure(self, *, reach: float) -> Measured:
         """Look at the poses as they are, for supports down to ``reach`` [m]."""
@@ -238,7 +139,7 @@ class FusedMeasure(_Fused):
 
     def __init__(self, scene: Scene, acts: Tensor, poses: Tensor) -> None:
         super().__init__(scene, acts, poses, None)
-        self._state = self._make_state(scene, poses, lm=False)
+        self._state, self._tensor = make_state(self._k, self._world, scene, poses, lm=False)
 
 
 class FusedCost(_Fused):
@@ -259,7 +160,7 @@ class FusedCost(_Fused):
         physics = self._physics = config.physics
         smoothing = None if physics.smoothing.kind == "none" else physics.smoothing
         super().__init__(scene, acts, poses, smoothing)
-        self._prior = self._make_prior(prior, scale)
+        self._prior = make_prior(self._k, prior, scale, self.dtype, self.device)
         lm = config.solver == "lm"
         options = self._k.Options()
         for name in ("pose_weight", "collision_weight", "gravity_weight", "softness"):
@@ -269,7 +170,7 @@ class FusedCost(_Fused):
         options.max_gradient = FAR if config.max_gradient is None else config.max_gradient
         options.smooth, options.newton, options.damping = int(smoothing is not None), int(lm), config.damping
         options.still_steps = LM_STILL_STEPS if lm else STILL_STEPS
-        self._state = self._make_state(scene, poses, lm=lm)
+        self._state, self._tensor = make_state(self._k, self._world, scene, poses, lm=lm)
         self.step = torch.zeros(self.n, 6, dtype=self.dtype, device=self.device)
         self._commands = self._record(self._launches(options))
 
@@ -342,27 +243,3 @@ class FusedCost(_Fused):
             "newton": (k.newton, self.n, [world, prior, state, options, 1.0, step]),
             "move": (k.move, self.n, [world, prior, state, options, step]),
         }
-
-    def _make_prior(self, prior: PosePrior, scale: Tensor) -> Any:
-        k = self._k
-        toward = (prior.precision[:, :3] * prior.ray[:, :, None]).sum(1)
-        out = k.Prior()
-        out.sigma_common = prior.sigma_common
-        out.robust = 0.0 if prior.robust == float("inf") else prior.robust
-        return fill(
-            out,
-            {
-                "measured": (prior.measured, k.mat44),
-                "precision": (prior.precision.reshape(-1, 6), k.vec6),
-                "ray": (prior.ray, k.vec3),
-                "toward": (toward, k.vec6),
-                "curvature": ((toward[:, :3] * prior.ray).sum(1), None),
-                "scale": (scale.reshape(-1, 6), k.vec6),
-            },
-            self.dtype,
-            self.device,
-        )
-
-
-def _starts(count: Tensor) -> Tensor:
-    return torch.cat([count.new_zeros(1), count.cumsum(0)])
