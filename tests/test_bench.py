@@ -196,7 +196,7 @@ def test_a_row_for_every_number_of_images(images):
     assert [r["images"] for r in rows] == [1, 4]
     assert [r["objects"] for r in rows] == [4, 16]  # three images, cycled
     for row in rows:
-        assert (row["backend"], row["preset"], row["solver"], row["repeats"]) == (BACKEND, "default", "descent", 1)
+        assert (row["backend"], row["preset"], row["repeats"]) == (BACKEND, "default", 1)
         assert row["ms_per_image"] > 0
         assert row["steps_mean"] == 4
     assert len(scenes_table(rows).splitlines()) == 4
@@ -220,11 +220,9 @@ def test_configurations_by_name():
     config = make_config("paper", BACKEND)
     assert config.optimizer == RefinerConfig.paper().optimizer
     assert config.physics.backend == BACKEND
-    assert make_config("default", BACKEND, "descent").physics.backend == BACKEND
-    with pytest.raises(InvalidInputError, match="expected one of default, paper"):
+    assert make_config("lm", BACKEND).solver == "lm"
+    with pytest.raises(InvalidInputError, match="expected one of default, lm, paper"):
         make_config("best", BACKEND)
-    with pytest.raises(InvalidInputError, match="solver"):
-        make_config("default", BACKEND, "no such solver")
 
 
 # ---- growth
@@ -320,7 +318,6 @@ def test_without_the_oracle_the_command_says_so(small, monkeypatch, capsys):
         (["growth", "--parts", "0"], "--parts"),
         (["pairs", "--device", "nowhere"], "--device nowhere"),
         (["pairs", "--threads", "0"], "--threads 0"),
-        (["scenes", "--solver", "magic"], "solver"),
     ],
 )
 def test_wrong_arguments_are_named(small, capsys, arguments, message):
@@ -329,7 +326,7 @@ def test_wrong_arguments_are_named(small, capsys, arguments, message):
 
 
 def test_a_plot_holds_whatever_was_measured(tmp_path):
-    scene = {"backend": "x", "preset": "default", "solver": "descent", "ms_per_image": 3.0, "ms_per_iteration": 0.5}
+    scene = {"backend": "x", "preset": "default", "ms_per_image": 3.0, "ms_per_iteration": 0.5}
     growth = {"varied": "parts", "parts": 1, "objects": 2, "images": 3, "backend": "x", "ms_per_iteration": 1.0}
     results = {
         "machine": {"device": "cpu", "cpu": "abacus", "torch_threads": 1},

@@ -123,7 +123,8 @@ def test_the_report_of_a_refinement_is_that_of_its_poses():
 
 
 @pytest.mark.parametrize("config", [RefinerConfig(), RefinerConfig.lm()], ids=["descent", "lm"])
-def test_threads_change_no_bit(config):
+def test_threads_change_no_bit(config, monkeypatch):
+    monkeypatch.setattr("physpose_torch.fused.cost.LEAST_ROWS", 16)
     bodies = [BOX, CAN] * 5
     scene = Scene.cat([Scene.tabletop(bodies, TABLE)] * 4)
     measured = torch.cat([standing(bodies, 0.01 * k, spacing=0.055) for k in range(4)])

@@ -111,21 +111,14 @@ class Scenes(_Bench):
     images: tuple[int, ...] = (1, 16, 64, 256)
     """Images in a batch."""
     preset: tuple[str, ...] = ("default",)
-    """default, paper, or both."""
-    solver: tuple[str, ...] = ()
-    """Solvers, where this version has several. Default: the preset's."""
+    """default, lm, paper, or several of them."""
     repeats: int = 3
     """Batches for each row, of different images as far as there are; the median counts."""
     keep_slow: bool = False
     """Also run fcl on more than 16 images."""
 
     def run(self, results: dict[str, Any], device: torch.device) -> None:
-        configs = [
-            (preset, make_config(preset, backend, solver))
-            for preset in self.preset
-            for backend in self._own_backends()
-            for solver in (self.solver or (None,))
-        ]
+        configs = [(preset, make_config(preset, backend)) for preset in self.preset for backend in self._own_backends()]
         options = {"repeats": self.repeats, "keep_slow": self.keep_slow}
         run_scenes(results, device, self.images, configs, self.data, self.seed, **options)
 
@@ -140,14 +133,10 @@ class Growth(_Bench):
     """Objects in an image; 8 parts each, 4 images."""
     images: tuple[int, ...] = (1, 4, 16, 64)
     """Images; 6 objects of 8 parts in each."""
-    solver: str | None = None
-    """Solver, where this version has several. Default: the preset's."""
 
     def run(self, results: dict[str, Any], device: torch.device) -> None:
         for backend in self._own_backends() if self.backend else backends()[:1]:
-            base = GrowthCase(
-                backend=backend, solver=self.solver, device=str(device), threads=self.threads, seed=self.seed
-            )
+            base = GrowthCase(backend=backend, device=str(device), threads=self.threads, seed=self.seed)
             run_growth(results, base, self.parts, self.objects, self.images)
 
 

@@ -57,7 +57,6 @@ class GrowthCase:
     varied: str = "images"
     """Which of the three the sweep varies."""
     backend: str = "auto"
-    solver: str | None = None
     device: str = "cpu"
     threads: int = 1
     seed: int = 0
@@ -105,7 +104,7 @@ def measure_growth(case: GrowthCase) -> dict[str, Any]:
     """
     torch.set_num_threads(case.threads)
     device = torch.device(case.device)
-    config = replace(make_config("default", case.backend, case.solver), steps=STEPS)
+    config = replace(make_config("default", case.backend), steps=STEPS)
     tiny = _batch(replace(case, parts=1, objects=2, images=1), device)
     _refine(tiny, config)
     _reset_peak(device)

@@ -79,7 +79,7 @@ def _batches(axes, results) -> None:
 
 
 def _scenes(axes, results) -> None:
-    keys = ("backend", "preset", "solver")
+    keys = ("backend", "preset")
     groups = _grouped(results["scenes"], keys)
     telling = [i for i in range(len(keys)) if len({g[i] for g in groups}) > 1] or [0]
     for i, (group, of) in enumerate(groups.items()):

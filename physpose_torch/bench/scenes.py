@@ -14,13 +14,14 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
 
 from physpose_torch.bench.images import BenchImage, batch_of
 from physpose_torch.bench.machine import seconds_of
+from physpose_torch.commands import PRESETS
 from physpose_torch.commands.common import table
 from physpose_torch.config import RefinerConfig
 from physpose_torch.errors import InvalidInputError
@@ -28,7 +29,6 @@ from physpose_torch.refiner import PhysPoseRefiner
 
 __all__ = ["bench_scenes", "make_config", "scenes_table", "seconds_per_iteration"]
 
-PRESETS = {"default": RefinerConfig, "paper": RefinerConfig.paper}
 SLOW = ("fcl",)
 """Backends that work pair by pair in Python, about a second an image."""
 SLOW_LIMIT = 16
@@ -40,21 +40,16 @@ PATIENCE = 10.0
 TIMES = ("ms_per_image", "ms_per_image_same_scene", "ms_per_iteration", "ms_scene_per_image")
 
 
-def make_config(preset: str, backend: str, solver: str | None = None) -> RefinerConfig:
-    """The preset with a backend, and a solver where there is a choice of solvers.
+def make_config(preset: str, backend: str) -> RefinerConfig:
+    """The preset with a backend.
 
     Raises:
-        InvalidInputError: unknown preset, or a solver that this version does not have.
+        InvalidInputError: unknown preset.
     """
     if preset not in PRESETS:
         raise InvalidInputError(f"preset {preset!r}: expected one of {', '.join(PRESETS)}")
     config = PRESETS[preset]()
-    config = replace(config, physics=replace(config.physics, backend=backend))
-    if solver is None or (solver == "descent" and not hasattr(config, "solver")):
-        return config
-    if not any(f.name == "solver" for f in fields(config)):
-        raise InvalidInputError(f"solver {solver!r}: this version has no choice of solvers; leave it out")
-    return replace(config, solver=solver)
+    return replace(config, physics=replace(config.physics, backend=backend))
 
 
 def bench_scenes(
@@ -108,7 +103,6 @@ def _row(images, count, preset, config, device, repeats, patience) -> dict[str, 
         "images": count,
         "backend": config.physics.backend,
         "preset": preset,
-        "solver": getattr(config, "solver", "descent"),
         "threads": torch.get_num_threads(),
         "repeats": len(samples),
         "step_limit": config.steps,
@@ -171,7 +165,7 @@ def _batch(images, count, repeat, device):
 
 def scenes_table(rows: list[dict[str, Any]]) -> str:
     """The rows as text."""
-    header = ["images", "backend", "preset", "solver", "objects", "steps", "ms/iteration", "ms/image", "same scene"]
+    header = ["images", "backend", "preset", "objects", "steps", "ms/iteration", "ms/image", "same scene"]
     header += ["Scene.cat", "cost/object", "inside [mm]", "gap [mm]", "repeats"]
     cells = []
     for r in rows:
@@ -181,7 +175,7 @@ def scenes_table(rows: list[dict[str, Any]]) -> str:
         cells.append(
             [
                 str(r["images"]),
-                *(r[k] for k in ("backend", "preset", "solver")),
+                *(r[k] for k in ("backend", "preset")),
                 *(f"{x:.0f}" for x in numbers),
                 *("-" if math.isnan(r[k]) else f"{r[k]:.2f}" for k in [*times, *quality]),
                 str(r["repeats"]),

@@ -21,8 +21,8 @@ __all__ = ["FusedCost", "FusedMeasure", "Measured", "remembers"]
 
 MOST_PAIRS = 50_000_000
 """Pairs of parts that a scene may have; each takes 40 bytes."""
-LEAST_ROWS = 64
-"""Fewer rows than this are not worth another thread."""
+LEAST_ROWS = 2000
+"""Fewer rows than this, some milliseconds of work, are not worth waiting for another thread."""
 LM_STILL_STEPS = 2
 """A Gauss-Newton step that moves nothing is nearly proof enough."""
 
