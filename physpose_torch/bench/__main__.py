@@ -7,6 +7,7 @@ import json
 import logging
 import math
 import sys
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,7 +37,7 @@ BUSY = 0.5
 
 
 @dataclass(frozen=True)
-class _Bench:
+class _Bench(ABC):
     """What every benchmark takes."""
 
     data: Path | None = None
@@ -79,8 +80,9 @@ class _Bench:
             plot_costs(self.plot, results)
         return 0
 
+    @abstractmethod
     def run(self, results: dict[str, Any], device: torch.device) -> None:
-        raise NotImplementedError
+        """Measure, print, and add to the results."""
 
     def _check_backends(self) -> None:
         known = [*backends(), *installed_loops()]

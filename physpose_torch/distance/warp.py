@@ -29,7 +29,9 @@ from physpose_torch.errors import BackendError
 from physpose_torch.geometry.convex import ConvexParts
 
 __all__ = [
+    "REAL",
     "fill",
+    "initialise",
     "launch",
     "load",
     "parts_struct",
@@ -51,6 +53,7 @@ _structs: "weakref.WeakKeyDictionary[ConvexParts, dict]" = weakref.WeakKeyDictio
 
 @functools.cache
 def initialise() -> None:
+    """Start Warp, quietly."""
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # no banner, no load times
     with contextlib.nullcontext() if torch.cuda.is_available() else _silent():
         wp.init()

@@ -135,7 +135,7 @@ def contact(real: type) -> SimpleNamespace:
     def fall_of(parts: Parts, a: wp.int32, b: wp.int32, R_a: mat33, t_a: vec3, R_b: mat33, t_b: vec3, g: vec3):
         """The fall of part a onto part b along g, poses and g in one frame."""
         back = wp.transpose(R_a)
-        return fall(parts, make_pair(parts, a, b, back * R_b, back * (t_b - t_a)), back * g)
+        return fall(parts, make_pair(a, b, back * R_b, back * (t_b - t_a)), back * g)
 
     @wp.kernel(enable_backward=False, module=module)
     def rows(
@@ -204,7 +204,7 @@ def contact(real: type) -> SimpleNamespace:
             inside = int(0)
             normal = vec3(zero, zero, zero)
             if gap <= reached:
-                both = make_pair(parts, part_a, part_b, R, t)
+                both = make_pair(part_a, part_b, R, t)
                 hint = state.slot_normal[slot]
                 if wp.dot(hint, hint) == zero:
                     hint = across(parts, both)

@@ -218,9 +218,8 @@ class FusedCost(_Fused):
 
     def evaluate(self, step: int) -> None:
         """Costs and gradient at the current poses; images that have come to rest are finished first."""
-        if self.n_images:
-            self._commands["priors"].set_param_at_index(3, step)
-        self._launch("boxes", "priors", "planes")
+        self.settle(step)
+        self._launch("boxes", "planes")
         self._launch_rows()
         self._launch("objects")
 

@@ -132,7 +132,7 @@ def objects(real: type) -> SimpleNamespace:
                 t_b = translation(state.poses[other])
                 hit = fall_of(parts, part_a, part_b, R, t, R_b, t_b, g)
                 back = wp.transpose(R)
-                met = make_pair(parts, part_a, part_b, back * R_b, back * (t_b - t - hit.height * g))
+                met = make_pair(part_a, part_b, back * R_b, back * (t_b - t - hit.height * g))
                 point = hit.a
                 if options.smooth == 1:
                     both = smoothed(parts, met, hit.normal, wobble)

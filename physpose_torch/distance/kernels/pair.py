@@ -64,9 +64,9 @@ def pairs(real: type) -> SimpleNamespace:
         lands: wp.int32
 
     @wp.func
-    def moved(parts: Parts, pair: Pair, shift: vec3):
+    def moved(pair: Pair, shift: vec3):
         """The pair with b moved."""
-        return make_pair(parts, pair.a, pair.b, pair.R, pair.t + shift)
+        return make_pair(pair.a, pair.b, pair.R, pair.t + shift)
 
     @wp.func
     def distance(parts: Parts, pair: Pair, hint: vec3, overlapping: wp.int32, enough: real, witness: wp.int32):
@@ -100,7 +100,7 @@ def pairs(real: type) -> SimpleNamespace:
                 out.normal = axis.normal
                 if witness == 1:
                     pull = (real(PULL) - axis.gap) * axis.normal
-                    facing = closest(parts, moved(parts, pair, pull), axis.normal, never, 1)
+                    facing = closest(parts, moved(pair, pull), axis.normal, never, 1)
                     out.a = facing.a
                     out.b = facing.b - pull
             else:
@@ -118,10 +118,10 @@ def pairs(real: type) -> SimpleNamespace:
         return out
 
     @wp.func
-    def relative(parts: Parts, a: wp.int32, b: wp.int32, R_a: mat33, R_b: mat33, t: vec3):
+    def relative(a: wp.int32, b: wp.int32, R_a: mat33, R_b: mat33, t: vec3):
         """The pair, b's pose in the frame of a; t is b's origin as seen from a's, in the frame of the poses."""
         back = wp.transpose(R_a)
-        return make_pair(parts, a, b, back * R_b, back * t)
+        return make_pair(a, b, back * R_b, back * t)
 
     @wp.func
     def outer(n: vec3, point: vec3):
@@ -152,7 +152,7 @@ def pairs(real: type) -> SimpleNamespace:
         origin = translation(T_a[i])
         R_a = orthonormal(rotation(T_a[i]))
         R_b = orthonormal(rotation(T_b[i]))
-        pair = relative(parts, int(pairs[i, 0]), int(pairs[i, 1]), R_a, R_b, translation(T_b[i]) - origin)
+        pair = relative(int(pairs[i, 0]), int(pairs[i, 1]), R_a, R_b, translation(T_b[i]) - origin)
         d = distance(parts, pair, across(parts, pair), 0, never, 1)
         value[i] = d.value
         normal[i] = R_a * d.normal
@@ -215,7 +215,7 @@ def pairs(real: type) -> SimpleNamespace:
         origin = translation(T_a[i])
         R_a = orthonormal(rotation(T_a[i]))
         R_b = orthonormal(rotation(T_b[i]))
-        pair = relative(parts, int(pairs[i, 0]), int(pairs[i, 1]), R_a, R_b, translation(T_b[i]) - origin)
+        pair = relative(int(pairs[i, 0]), int(pairs[i, 1]), R_a, R_b, translation(T_b[i]) - origin)
         g = wp.normalize(wp.transpose(R_a) * gravity[i])
         d = drop_distance(parts, pair, g)
         value[i] = never
@@ -227,7 +227,7 @@ def pairs(real: type) -> SimpleNamespace:
             rate = wp.dot(d.normal, g)
             # what is inside already, or slides along, cannot fall any less; the rest is bounded where it only grazes
             if gradient_a.shape[0] > 0 and rate > real(0.0) and d.lands == 1:
-                met = moved(parts, pair, -d.height * g)
+                met = moved(pair, -d.height * g)
                 p = Points()
                 p.a = d.a
                 p.b = d.b - d.height * g

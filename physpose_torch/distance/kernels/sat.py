@@ -92,7 +92,7 @@ def sat(real: type) -> SimpleNamespace:
                     remembered = 1
                     if seen[edge[2]] == seen[edge[3]]:
                         continue  # it bounds the whole arc
-                anchor = parts.vertices[pair.first_a + edge[0]]
+                anchor = parts.vertices[parts.vertex_start[pair.a] + edge[0]]
                 stack_n0[0] = parts.normals[start_a + edge[2]]
                 stack_n1[0] = parts.normals[start_a + edge[3]]
                 if remembered == 1:

@@ -11,7 +11,7 @@ LANES = 4
 FARTHEST = """
     // four vertices at a time, which the compiler turns into vector instructions
     typedef REAL real;
-    typedef decltype(sizeof(real) == 8 ? 0ll : 0) index;
+    typedef long long index;  // as wide as a double, so that comparisons select both alike
     real top[4] = {-1e30f, -1e30f, -1e30f, -1e30f};
     index block[4] = {0, 0, 0, 0};
     const real* p = lanes.data + 12 * (size_t)first;
@@ -65,10 +65,6 @@ def shapes(real: type) -> SimpleNamespace:
 
         a: wp.int32
         b: wp.int32
-        first_a: wp.int32
-        last_a: wp.int32
-        first_b: wp.int32
-        last_b: wp.int32
         R: mat33
         t: vec3
 
@@ -103,14 +99,10 @@ def shapes(real: type) -> SimpleNamespace:
         return vec3(T[0, 3], T[1, 3], T[2, 3])
 
     @wp.func
-    def make_pair(parts: Parts, a: wp.int32, b: wp.int32, R: mat33, t: vec3):
+    def make_pair(a: wp.int32, b: wp.int32, R: mat33, t: vec3):
         pair = Pair()
         pair.a = a
         pair.b = b
-        pair.first_a = parts.vertex_start[a]
-        pair.last_a = parts.vertex_start[a + 1]
-        pair.first_b = parts.vertex_start[b]
-        pair.last_b = parts.vertex_start[b + 1]
         pair.R = R
         pair.t = t
         return pair

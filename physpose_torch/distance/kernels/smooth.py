@@ -13,7 +13,7 @@ MOMENTS = """
     // mean and second moments of the vertex foremost along each wobbling direction, relative to the foremost of all;
     // eight directions at a time, which the compiler turns into vector instructions
     typedef REAL real;
-    typedef decltype(sizeof(real) == 8 ? 0ll : 0) index;
+    typedef long long index;
     const int lanes = 8, room = 96;
     const wp::vec_t<3, real> origin = vertices.data[foremost];
     const real tilt = noise * reach, shrink = tangential ? real(1) : real(1) - tilt;
