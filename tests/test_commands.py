@@ -158,11 +158,11 @@ def test_problems_are_told_in_file_order_whatever_is_refined_in_between(dataset)
 
 
 def test_batches_are_of_usable_images_and_of_what_stands_between_them():
-    from physpose_torch.commands.refine import _batches
+    from physpose_torch.commands.images import in_batches
 
     def numbers(usable, size):
         images = (SimpleNamespace(number=k, scene=object() if x else None) for k, x in enumerate(usable))
-        return [[i.number for i in batch] for batch in _batches(images, size)]
+        return [[i.number for i in batch] for batch in in_batches(images, size)]
 
     assert numbers([1, 0, 1, 1, 0, 0, 1, 1, 0], 2) == [[0, 1, 2], [3, 4, 5, 6], [7, 8]]
     assert numbers([0, 0], 2) == [[0, 1]]
@@ -172,9 +172,10 @@ def test_batches_are_of_usable_images_and_of_what_stands_between_them():
 
 def test_the_images_of_a_batch_are_made_after_the_one_before_is_refined(dataset, monkeypatch):
     """So memory does not grow with the file."""
+    from physpose_torch.commands import images as opening
     from physpose_torch.commands import refine as module
 
-    events, refine_batch, scenes = [], module._refine, module.image_scenes
+    events, refine_batch, scenes = [], module._refine, opening.image_scenes
 
     def making(*args, **options):
         for image in scenes(*args, **options):
@@ -185,7 +186,7 @@ def test_the_images_of_a_batch_are_made_after_the_one_before_is_refined(dataset,
         events.append(("refined", *(i.im_id for i in images)))
         return refine_batch(images, *args)
 
-    monkeypatch.setattr(module, "image_scenes", making)
+    monkeypatch.setattr(opening, "image_scenes", making)
     monkeypatch.setattr(module, "_refine", refining)
     assert refine(dataset, "--batch", "1", "--config.steps", "1") == 0
     assert events == [("made", 3), ("refined", 3), ("made", 7), ("refined", 7)]
