@@ -5,6 +5,7 @@ import json
 import numpy as np
 import torch
 import trimesh
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 OBJECTS = {
@@ -49,6 +50,14 @@ def write_scene(split, scene_id, images, *, visib=True, width=None):
     if width:
         (split.parent / "camera.json").write_text(json.dumps({"width": width, "height": 480}))
     return folder
+
+
+def write_depth(folder, im_id, depth, *, scale=0.1):
+    """`depth`: (H, W) [m], 0 where unknown; to the next `scale` mm. `folder`: the scene's."""
+    path = folder / "depth" / f"{im_id:06d}.png"
+    path.parent.mkdir(exist_ok=True)
+    Image.fromarray(np.round(np.asarray(depth) * 1000 / scale).astype(np.uint16)).save(path)
+    return path
 
 
 def write_models(folder, *, info=True):

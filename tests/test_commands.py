@@ -267,24 +267,6 @@ def test_an_unknown_preset_is_refused(capsys):
     assert "fancy" in capsys.readouterr().err
 
 
-def test_eval_scores_truth_with_one_and_counts_what_is_in_the_table(dataset, capsys):
-    truth = [
-        csv_row(2, 3, 1, 1.0, standing(-80, 0, 50)),
-        csv_row(2, 3, 4, 1.0, standing(60, 30, 15)),
-        csv_row(2, 7, 9, 1.0, standing(0, 0, 35)),
-    ]
-    (dataset / "gt.csv").write_text("\n".join([HEADER, *truth]) + "\n")
-    out = dataset / "scores.json"
-    args = ["--dataset", str(dataset), "--planes", str(dataset / "planes.json"), "--json", str(out)]
-    assert main(["eval", str(dataset / "gt.csv"), *args]) == 0
-    scores = json.loads(out.read_text())
-    assert scores["ar_mssd"] == scores["ar_mspd"] == 1.0
-    assert scores["inside_table"] == {"count": 3, "estimates": 0.0, "above": 0.0, "ground_truth": 0.0}
-    assert "AR_MSSD" in capsys.readouterr().out
-    assert main(["eval", str(dataset / "est.csv"), *args, "--quiet"]) == 0
-    assert json.loads(out.read_text())["inside_table"]["estimates"] == 1.0
-
-
 def test_decompose_reports_every_mesh_and_names_the_broken_one(dataset, capsys):
     (dataset / "models" / "obj_000050.ply").write_text("not a mesh")
     out = dataset / "parts.json"

@@ -13,12 +13,15 @@ from physpose_torch.bop.formats import (
     read_targets,
     write_estimates,
 )
-from physpose_torch.bop.metrics import GroundTruthErrors, Recall, Scores, errors_against_gt, evaluate, mspd, mssd
+from physpose_torch.bop.metrics import Recall, Scores, VsdScore, evaluate
+from physpose_torch.bop.pose_error import mspd, mssd
+from physpose_torch.bop.residuals import Distribution, GroundTruthErrors, distribution, errors_against_gt
 
 __all__ = [
     "MESH_SCALE",
     "BopDataset",
     "Camera",
+    "Distribution",
     "Estimates",
     "GroundTruth",
     "GroundTruthErrors",
@@ -28,6 +31,8 @@ __all__ = [
     "Scores",
     "StaticRecord",
     "Target",
+    "VsdScore",
+    "distribution",
     "errors_against_gt",
     "evaluate",
     "mspd",

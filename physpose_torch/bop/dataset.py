@@ -29,6 +29,7 @@ _log = logging.getLogger("physpose_torch")
 _MIN_VISIBLE = 0.1  # BOP19 asks only for objects that are visible to 10 %
 _IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 _WIDTHS = (320, 400, 424, 640, 720, 800, 848, 960, 1024, 1280, 1440, 1600, 1920, 2048, 2560, 3840)
+_RATIOS = (3 / 4, 5 / 8, 9 / 16)
 
 
 class Camera(NamedTuple):
@@ -134,21 +135,25 @@ class BopDataset:
 
     def vertices(self, obj_id: int) -> torch.Tensor:
         """Vertices of the mesh for errors, object frame, shape (V, 3) float64 [m]."""
+        return self._mesh(obj_id)[0]
 
-        def load() -> torch.Tensor:
-            import trimesh  # only needed here, and slow to import
+    def faces(self, obj_id: int) -> torch.Tensor:
+        """Triangles of the mesh for errors, rows of `vertices`, shape (F, 3) int64."""
+        return self._mesh(obj_id)[1]
 
-            path = self.model_path(obj_id, evaluation=True)
+    def hull(self, obj_id: int) -> torch.Tensor:
+        """The `vertices` that are corners of their convex hull, shape (H, 3) float64 [m]; all, if they are flat."""
+
+        def find() -> torch.Tensor:
+            from scipy.spatial import ConvexHull, QhullError
+
+            vertices = self.vertices(obj_id)
             try:
-                mesh = trimesh.load_mesh(path, process=False)
-                points = np.array(mesh.vertices, dtype=np.float64)
-            except Exception as error:
-                raise DataError(f"{path}: cannot be read as a mesh ({error}); download the model again") from error
-            if not len(points) or not np.isfinite(points).all():
-                raise DataError(f"{path}: no vertices, or not finite ones; download the model again")
-            return torch.from_numpy(points) * MESH_SCALE
+                return vertices[ConvexHull(vertices.numpy()).vertices]
+            except (QhullError, ValueError):  # flat, or too few points
+                return vertices
 
-        return self._once(("vertices", obj_id), load)
+        return self._once(("hull", obj_id), find)
 
     def diameter(self, obj_id: int) -> float:
         """Diameter of an object [m], from models_info.json.
@@ -252,20 +257,59 @@ class BopDataset:
         Raises:
             DataError: There is no such file.
         """
-        if kind not in ("rgb", "gray", "depth"):
-            raise InvalidInputError(f"kind is {kind!r}, expected 'rgb', 'gray' or 'depth'")
-        folder = self._scene(scene_id) / kind
-        for ending in _IMAGES:
-            if (path := folder / f"{int(im_id):06d}{ending}").is_file():
-                return path
-        raise DataError(f"scene {scene_id}, image {im_id}: no {kind} image in {folder}; download it")
+        if (path := self._image_file(scene_id, im_id, kind)) is None:
+            folder = self._scene(scene_id) / kind
+            raise DataError(f"scene {scene_id}, image {im_id}: no {kind} image in {folder}; download it")
+        return path
+
+    def has_image(self, scene_id: int, im_id: int, kind: str = "rgb") -> bool:
+        """Whether there is the file of an image: `rgb`, `gray` or `depth`."""
+        return self._image_file(scene_id, im_id, kind) is not None
+
+    def depth(self, scene_id: int, im_id: int) -> torch.Tensor:
+        """A depth image: z in the camera frame, shape (H, W) float64 [m]; 0 where it is unknown.
+
+        Raises:
+            DataError: The file is missing, unreadable, of 8 bits, or not of the size of the colour image; or
+                scene_camera.json has no depth_scale.
+        """
+        from PIL import Image
+
+        path = self.image_path(scene_id, im_id, "depth")
+        scale = self.camera(scene_id, im_id).depth_scale
+        if scale is None or not scale > 0:
+            place = f"{self._scene(scene_id) / 'scene_camera.json'}, image {im_id}"
+            raise DataError(f"{place}: no positive 'depth_scale', so {path} has no unit; add it [mm per value]")
+        try:
+            with Image.open(path) as opened:
+                mode, values = opened.mode, np.array(opened)
+        except (OSError, SyntaxError, ValueError) as error:  # SyntaxError: Pillow's word for a broken PNG
+            raise DataError(f"{path}: cannot be read as an image ({error}); download it again") from error
+        if values.ndim != 2 or not mode.startswith(("I", "F")):
+            what = f"Pillow's mode {mode}, shape {values.shape}"
+            raise DataError(f"{path}: not a depth image ({what}); expected one channel of 16 bits")
+        for other in filter(None, (self._image_file(scene_id, im_id, kind) for kind in ("rgb", "gray"))):
+            size = _size(other)
+            if size and size != values.shape[::-1]:
+                sizes = f"{values.shape[1]}×{values.shape[0]} px, but {other} is {size[0]}×{size[1]} px"
+                raise DataError(f"{path}: {sizes}; K belongs to one of them, bring the depth to the other's view")
+        values = values.astype(np.float64)
+        return torch.from_numpy(np.where(np.isfinite(values) & (values > 0), values, 0.0)) * scale
 
     def image_width(self, scene_id: int) -> int:
-        """Width of a scene's images [px]: the one given, that of an image on disk, or that in `camera*.json`.
+        """Width of a scene's images [px]: the one given, or as in `image_size`."""
+        return self._image_width or self.image_size(scene_id)[0]
 
-        If all fail, the usual width nearest to twice the principal point, with a warning.
+    def image_size(self, scene_id: int) -> tuple[int, int]:
+        """Width and height of a scene's images [px]: of an image on disk, or as in `camera*.json`.
+
+        If all fail, the usual width nearest to twice the principal point and a height to go with it, with a warning.
+        A width given to the constructor replaces another one, the height then keeps its proportion.
         """
-        return self._image_width or self._once(("width", scene_id), lambda: self._find_width(scene_id))
+        width, height = self._once(("size", scene_id), lambda: self._find_size(scene_id))
+        if self._image_width and self._image_width != width:
+            return self._image_width, round(height * self._image_width / width)
+        return width, height
 
     # Insides
 
@@ -360,30 +404,65 @@ class BopDataset:
         T = torch.from_numpy(np.array(poses, dtype=np.float64).reshape(-1, 4, 4))
         return GroundTruth(*columns, T, np.array(visible, dtype=np.float64))
 
-    def _find_width(self, scene_id: int) -> int:
-        from PIL import Image
+    def _mesh(self, obj_id: int) -> tuple[torch.Tensor, torch.Tensor]:
+        def load() -> tuple[torch.Tensor, torch.Tensor]:
+            import trimesh  # only needed here, and slow to import
 
+            path = self.model_path(obj_id, evaluation=True)
+            try:
+                mesh = trimesh.load_mesh(path, process=False)
+                points = np.array(mesh.vertices, dtype=np.float64)
+                faces = np.array(mesh.faces, dtype=np.int64)
+            except Exception as error:
+                raise DataError(f"{path}: cannot be read as a mesh ({error}); download the model again") from error
+            if not len(faces) or not np.isfinite(points).all():  # trimesh gives a point cloud no points at all
+                raise DataError(f"{path}: no faces, or vertices that are not finite; download the model again")
+            if not 0 <= faces.min() <= faces.max() < len(points):
+                raise DataError(f"{path}: faces of vertices that are not there; download the model again")
+            return torch.from_numpy(points) * MESH_SCALE, torch.from_numpy(faces)
+
+        return self._once(("mesh", obj_id), load)
+
+    def _image_file(self, scene_id: int, im_id: int, kind: str) -> Path | None:
+        if kind not in ("rgb", "gray", "depth"):
+            raise InvalidInputError(f"kind is {kind!r}, expected 'rgb', 'gray' or 'depth'")
+        stem = self._scene(scene_id) / kind / f"{int(im_id):06d}"
+        return next((path for ending in _IMAGES if (path := stem.with_suffix(ending)).is_file()), None)
+
+    def _find_size(self, scene_id: int) -> tuple[int, int]:
         for folder in (self._scene(scene_id), *self._scenes.values()):
             for image in (image for kind in ("rgb", "gray", "depth") for image in sorted((folder / kind).glob("*"))):
-                if image.suffix.lower() in _IMAGES:
-                    with contextlib.suppress(OSError), Image.open(image) as opened:
-                        return opened.width
-            if folder == self._scene(scene_id) and (width := self._camera_file_width()):
-                return width
+                if image.suffix.lower() in _IMAGES and (size := _size(image)):
+                    return size
+            if folder == self._scene(scene_id) and (size := self._camera_file_size()):
+                return size
         cameras = self._scene_file(scene_id, "scene_camera.json")
-        double = 2 * float(self.camera(scene_id, next(iter(cameras))).K[0, 2])
-        width = min(_WIDTHS, key=lambda width: abs(width - double))
+        cx, cy = self.camera(scene_id, next(iter(cameras))).K[:2, 2].tolist()
+        width = min(_WIDTHS, key=lambda width: abs(width - 2 * cx))
+        height = min((round(width * ratio) for ratio in _RATIOS), key=lambda height: abs(height - 2 * cy))
         message = "%s has neither images nor a camera.json: taking them to be %d px wide, as cx = %.1f suggests"
-        _log.warning(message, self._scene(scene_id), width, double / 2)
-        return width
+        _log.warning(message + ", and %d px high (cy = %.1f)", self._scene(scene_id), width, cx, height, cy)
+        return width, height
 
-    def _camera_file_width(self) -> int | None:
+    def _camera_file_size(self) -> tuple[int, int] | None:
         sensor = self.split_path.name.partition("_")[2]
         names = [f"camera_{sensor}.json", "camera.json"]
         paths = [self.path / name for name in names if (self.path / name).is_file()][:1]
         cameras = [load_json(path) for path in paths or sorted(self.path.glob("camera_*.json"))]
-        widths = {camera.get("width") for camera in cameras if isinstance(camera, dict)}
-        return int(widths.pop()) if len(widths) == 1 and widths < set(range(1, 100_000)) else None
+        sizes = [(camera.get("width"), camera.get("height")) for camera in cameras if isinstance(camera, dict)]
+        if not sizes or any(size != sizes[0] for size in sizes):
+            return None
+        width, height = (x if isinstance(x, int) and 0 < x < 100_000 else None for x in sizes[0])
+        return (width, height or round(width * 3 / 4)) if width else None
+
+
+def _size(image: Path) -> tuple[int, int] | None:
+    """Width and height of an image file [px], None if it is not one."""
+    from PIL import Image
+
+    with contextlib.suppress(OSError, SyntaxError), Image.open(image) as opened:
+        return opened.size
+    return None
 
 
 def symmetry_transforms(info: dict, max_step: float = 0.01) -> torch.Tensor:

@@ -6,7 +6,8 @@ import logging
 import numpy as np
 import pytest
 import torch
-from bop_files import K, metres, random_pose, write_mesh, write_models, write_scene
+import trimesh
+from bop_files import K, metres, random_pose, write_depth, write_mesh, write_models, write_scene
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -196,6 +197,46 @@ def test_image_width_comes_from_the_option_an_image_the_camera_file_or_the_princ
     with caplog.at_level(logging.WARNING, "physpose_torch"):
         assert BopDataset(bop_folder).image_width(11) == 640
     assert "taking them to be 640 px wide, as cx = 330.0 suggests" in caplog.text
+
+
+def test_image_height_comes_with_the_width(bop_folder, caplog):
+    assert BopDataset(bop_folder).image_size(2) == (720, 480)  # camera.json
+    assert BopDataset(bop_folder, image_width=1440).image_size(2) == (1440, 960)
+    (bop_folder / "camera.json").write_text('{"width": 1280}')
+    assert BopDataset(bop_folder).image_size(2) == (1280, 960)
+    (bop_folder / "camera.json").unlink()
+    with caplog.at_level(logging.WARNING, "physpose_torch"):
+        assert BopDataset(bop_folder).image_size(2) == (640, 480)  # cx = 330, cy = 236
+    assert "480 px high (cy = 236.0)" in caplog.text
+    camera = json.loads((bop_folder / "test" / "000002" / "scene_camera.json").read_text())
+    for entry in camera.values():
+        entry["cam_K"][2], entry["cam_K"][5] = 961.0, 537.0
+    (bop_folder / "test" / "000002" / "scene_camera.json").write_text(json.dumps(camera))
+    assert BopDataset(bop_folder).image_size(2) == (1920, 1080)
+
+
+def test_a_depth_image_is_read_in_metres_and_unknown_is_zero(bop_folder):
+    depth = np.array([[0, 0.5, 1.25], [0.0001, 6.5535, 0]])
+    write_depth(bop_folder / "test" / "000002", 40, depth)
+    dataset = BopDataset(bop_folder)
+    assert dataset.has_image(2, 40, "depth")
+    assert not dataset.has_image(2, 3, "depth")
+    read = dataset.depth(2, 40)
+    assert read.dtype == torch.float64
+    np.testing.assert_allclose(read, depth, atol=1e-12)
+    with pytest.raises(DataError, match="scene 2, image 3: no depth image"):
+        dataset.depth(2, 3)
+
+
+def test_a_mesh_has_faces_and_the_corners_of_its_hull(bop_folder):
+    dataset = BopDataset(bop_folder)
+    assert dataset.faces(1).shape == (192, 3)  # a box, each side cut into 32 triangles
+    assert dataset.faces(1).max() < len(dataset.vertices(1)) == 98
+    corners = dataset.hull(1)
+    assert corners.abs().unique(dim=0).tolist() == [pytest.approx([0.03, 0.02, 0.05])]
+    flat = trimesh.Trimesh([[0, 0, 0], [10, 0, 0], [0, 10, 0]], [[0, 1, 2]], process=False)
+    flat.export(bop_folder / "models" / "obj_000004.ply")
+    assert len(BopDataset(bop_folder).hull(4)) == 3
 
 
 def test_discrete_symmetries_come_in_metres_after_the_identity(bop_folder):

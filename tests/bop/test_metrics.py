@@ -9,7 +9,7 @@ import pytest
 import torch
 from bop_files import OBJECTS, K, csv_row, metres, random_pose, write_models, write_scene
 
-from physpose_torch.bop import metrics
+from physpose_torch.bop import pose_error
 from physpose_torch.bop.dataset import BopDataset, symmetry_transforms
 from physpose_torch.bop.formats import read_estimates
 from physpose_torch.bop.metrics import (
@@ -21,6 +21,7 @@ from physpose_torch.bop.metrics import (
     mspd,
     mssd,
 )
+from physpose_torch.bop.residuals import distribution
 from physpose_torch.errors import DataError, InvalidInputError
 
 EYE = torch.eye(4, dtype=torch.float64)
@@ -93,7 +94,7 @@ def test_errors_equal_plain_loops_over_symmetries_and_vertices(obj_id, noise, rn
     surface = [plain_error(a, b, points, group) for a, b in zip(*arrays, strict=True)]
     image = [plain_error(a, b, points, group, K3.numpy()) for a, b in zip(*arrays, strict=True)]
     for probes in (128, 1):  # with one vertex the lower bounds are as bad as can be
-        monkeypatch.setattr(metrics._outlying, "__kwdefaults__", {"count": probes})
+        monkeypatch.setattr(pose_error._outlying, "__kwdefaults__", {"count": probes})
         np.testing.assert_allclose(mssd(T_est, T_gt, vertices, symmetries), surface, rtol=1e-10, atol=1e-14)
         np.testing.assert_allclose(mspd(T_est, T_gt, K3, vertices, symmetries), image, rtol=1e-8, atol=1e-9)
 
@@ -172,8 +173,10 @@ def test_recall_counts_thresholds_above_the_error(tmp_path, write_csv):
     assert result.ar_mssd == pytest.approx(0.6)
     assert result.gt_mssd.tolist() == [[-1] * 4 + [0] * 6]
     assert result.targets == 1
-    assert result.per_object == {1: (pytest.approx(0.6), result.ar_mspd, 1)}
-    assert result.per_scene == {1: (pytest.approx(0.6), result.ar_mspd, 1)}
+    assert result.per_object == {1: (pytest.approx(0.6), result.ar_mspd, 1, None)}
+    assert result.per_scene == {1: (pytest.approx(0.6), result.ar_mspd, 1, None)}
+    assert result.per_image == {(1, 1): (pytest.approx(0.6), result.ar_mspd, 1, None)}
+    assert (result.vsd, result.ar_vsd, result.ar) == (None, None, None)
     assert json.loads(json.dumps(result.to_dict()))["ar_mssd"] == pytest.approx(0.6)
 
 
@@ -295,7 +298,8 @@ def test_scores_equal_plain_loops_on_random_estimates(bop_folder, write_csv, rng
     np.testing.assert_allclose(result.recall_mssd, expected[0], atol=1e-12)
     np.testing.assert_allclose(result.recall_mspd, expected[1], atol=1e-12)
     assert 0.2 < result.ar_mssd < 0.9  # neither trivial nor hopeless
-    for per in (result.per_object, result.per_scene):
+    assert len(result.per_image) == 4
+    for per in (result.per_object, result.per_scene, result.per_image):
         assert sum(part.targets for part in per.values()) == result.targets
         total = sum(part.ar_mssd * part.targets for part in per.values())
         assert total == pytest.approx(result.ar_mssd * result.targets)
@@ -327,6 +331,37 @@ def test_errors_are_split_along_and_across_the_ray_to_the_centre_and_turned_by_s
     assert all(np.isnan(x[1]) for x in (errors.mssd, errors.along_ray, errors.across_ray, errors.rotation))
     exact = errors_against_gt(est, dataset, poses=T.expand(2, 4, 4))
     assert max(exact.mssd[0], abs(exact.along_ray[0]), exact.across_ray[0], exact.rotation[0]) < 1e-12
+
+
+def test_a_distribution_is_robust_and_its_histogram_shows_the_bulk_in_round_bins(rng):
+    values = np.concatenate([rng.normal(20, 9, 980), np.full(20, 500.0)])
+    d = distribution(values)
+    assert d.median == np.median(values)
+    assert d.robust_sigma == pytest.approx(9, rel=0.1)
+    assert d.mean == pytest.approx(values.mean())
+    assert (d.p5, d.p95) == tuple(np.percentile(values, [5, 95]))
+    assert d.counts.sum() + d.below + d.above == d.count == 1000
+    assert d.above >= 20
+    assert np.diff(d.edges) == pytest.approx(5)
+    assert (d.edges % 5 == 0).all()
+    for k, count in enumerate(d.counts):
+        assert count == ((values >= d.edges[k]) & (values < d.edges[k + 1])).sum()
+
+
+@pytest.mark.parametrize("values", [[], [20.0], [0.0] * 9, [-3.0, 1e6], [1e-14, -1e-14]])
+def test_a_distribution_of_few_or_equal_numbers_has_a_histogram_too(values):
+    d = distribution(np.array(values))
+    assert d.counts.sum() + d.below + d.above == d.count == len(values)
+    assert np.diff(d.edges).min() >= 0.0999
+    assert len(d.edges) < 20
+    assert json.loads(json.dumps(d.to_dict(), allow_nan=False))["median"] == (np.median(values) if values else None)
+
+
+def test_chosen_rows_alone_are_compared(bop_folder, write_csv):
+    gt = BopDataset(bop_folder).ground_truth(2)
+    T = gt.T_camera_object[0].numpy() * np.array([1, 1, 1, 1000.0])
+    est = read_estimates(write_csv(csv_row(2, 3, 1, 1, T), csv_row(2, 3, 1, 1, T)))
+    assert errors_against_gt(est, BopDataset(bop_folder), rows=np.array([False, True])).gt_id.tolist() == [-1, 0]
 
 
 # The real data
