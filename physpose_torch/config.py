@@ -1,11 +1,13 @@
 """Options, as frozen dataclasses with a sentence under each field; the command line is made from them."""
 
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from physpose_torch.errors import InvalidInputError
 
-__all__ = ["STILL_STEPS", "PhysicsConfig", "RefinerConfig", "Smoothing"]
+__all__ = ["STILL_STEPS", "Calibration", "PhysicsConfig", "RefinerConfig", "Smoothing"]
 
 STILL_STEPS = 10
 """An image stops after this many steps of a descent on end without motion."""
@@ -44,20 +46,45 @@ class Smoothing:
 
 
 @dataclass(frozen=True)
+class Calibration:
+    """What an estimator's errors are like, see :func:`physpose_torch.calibrate`; for :meth:`RefinerConfig.calibrated`."""
+
+    depth_factor: float
+    """What estimated translations must be multiplied by."""
+    sigma_ray_fraction: float
+    """Standard deviation along the viewing ray, as a fraction of the range, of each estimate by itself."""
+    sigma_lateral: float
+    """Standard deviation across the viewing ray, per axis [m]."""
+    sigma_rotation: float
+    """Standard deviation of the rotation, per axis [rad]."""
+    sigma_depth_common: float = 0.0
+    """Standard deviation of the depth factor that the estimates of one image share, from image to image."""
+    interval: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """95 % confidence interval of each of these numbers, by name."""
+
+    def __post_init__(self) -> None:
+        _check_positive(self, "depth_factor", "sigma_ray_fraction", "sigma_lateral", "sigma_rotation")
+        if not self.sigma_depth_common >= 0:
+            raise InvalidInputError(f"Calibration.sigma_depth_common = {self.sigma_depth_common}, expected >= 0")
+
+
+@dataclass(frozen=True)
 class PhysicsConfig:
     """The cost of a set of poses: pose + collision + gravity (paper Eq. 1). Lengths in metres."""
 
+    depth_factor: float = 1.0
+    """What the estimates' translations are multiplied by first: the prior is centred there. An estimator's depth bias."""
     sigma_lateral: float = 0.002
     """Standard deviation of an estimate across its viewing ray [m]."""
     sigma_ray: float = 0.0
     """Standard deviation of an estimate along its viewing ray [m], a constant part."""
     sigma_ray_fraction: float = 0.01
     """The part of it that grows with range: RGB estimators misjudge size and depth by a factor."""
-    sigma_depth_common: float = 0.03
+    sigma_depth_common: float = 0.025
     """Standard deviation of the depth factor that all estimates of one image share; 0: errors are independent. Objects in
-    contact with the table then correct the depth of those that are not."""
-    sigma_rotation: float = 0.02
-    """Standard deviation of an estimate's rotation per axis [rad]. A looser one soaks up depth error as tilt."""
+    contact with the table then correct the depth of those that are not. Only where something static is known."""
+    sigma_rotation: float = 0.026
+    """Standard deviation of an estimate's rotation per axis [rad]: 1.5°. A looser one soaks up depth error as tilt."""
     robust: float = 4.0
     """ν of the robust pose cost ½ ν log(1 + m²/ν), m the Mahalanobis distance: an estimate that physics contradicts by
     more than √ν σ is believed less and less; infinite: the paper's ½ m²."""
@@ -83,7 +110,7 @@ class PhysicsConfig:
     """Distance backend: ``auto``, or a name in ``physpose_torch.distance.backends()``."""
 
     def __post_init__(self) -> None:
-        _check_positive(self, "sigma_lateral", "sigma_rotation", "gravity_reach", "robust")
+        _check_positive(self, "depth_factor", "sigma_lateral", "sigma_rotation", "gravity_reach", "robust")
         for name in (
             "sigma_ray",
             "sigma_ray_fraction",
@@ -111,15 +138,18 @@ class RefinerConfig:
     start: Literal["slide", "measured"] = "slide"
     """Where to start: ``slide``: estimates that lie in a plane start where their viewing ray leads out of it, which is where
     most of them end and brings grossly sunken ones within reach. ``measured``: at the estimates, as in the paper."""
+    righting: float = math.radians(75)
+    """An object that would fall over where it comes to rest, whatever carries it, is turned to the nearest stable pose that is
+    no farther than this [rad] and refined once more; 0: never. Estimates that wrong are mostly of the wrong side."""
     solver: Literal["descent", "lm"] = "descent"
     """``descent``: a first-order torch.optim optimizer. ``lm``: damped Gauss-Newton steps (Levenberg-Marquardt)."""
     damping: float = 3.0
     """lm: added to the curvature; that of an estimate by itself is 1 or more in each direction."""
     optimizer: Literal["adam", "sgd"] = "adam"
     """torch.optim.Adam on steps scaled by each estimate's σ, or plain gradient descent (the paper's)."""
-    steps: int = 60
+    steps: int = 40
     """Largest number of steps."""
-    learning_rate: float = 0.15
+    learning_rate: float = 0.2
     """Adam: first step, in σ. sgd: the paper's step on the cost's gradient. lm: fraction of the Gauss-Newton step."""
     decay: Literal["cosine", "none"] = "cosine"
     """Learning rate over the steps; without decay contacts bounce by about learning_rate · ζ."""
@@ -136,6 +166,8 @@ class RefinerConfig:
         _check_positive(self, "learning_rate", "max_step", "damping")
         if self.solver not in ("descent", "lm"):
             raise InvalidInputError(f"RefinerConfig.solver = {self.solver!r}, expected 'descent' or 'lm'")
+        if not 0 <= self.righting <= math.pi:
+            raise InvalidInputError(f"RefinerConfig.righting = {self.righting}, expected an angle from 0 to π [rad]")
         if not (isinstance(self.steps, int) and self.steps >= 0):
             raise InvalidInputError(f"RefinerConfig.steps = {self.steps}, expected an integer >= 0")
         if self.start not in ("slide", "measured"):
@@ -150,10 +182,24 @@ class RefinerConfig:
         if not self.tolerance >= 0:
             raise InvalidInputError(f"RefinerConfig.tolerance = {self.tolerance}, expected a number >= 0 [m]")
 
+    def calibrated(self, calibration: Calibration) -> "RefinerConfig":
+        """The same with an estimator's own bias and spread in place of the usual ones."""
+        c = calibration
+        physics = replace(
+            self.physics,
+            depth_factor=c.depth_factor,
+            sigma_ray=0.0,
+            sigma_ray_fraction=c.sigma_ray_fraction,
+            sigma_depth_common=c.sigma_depth_common,
+            sigma_lateral=c.sigma_lateral,
+            sigma_rotation=c.sigma_rotation,
+        )
+        return replace(self, physics=physics)
+
     @classmethod
     def lm(cls) -> "RefinerConfig":
-        """The default cost, minimised by ten Gauss-Newton steps instead of sixty of Adam's."""
-        return cls(solver="lm", steps=10, learning_rate=0.5)
+        """The default cost, minimised by fifteen Gauss-Newton steps instead of forty of Adam's."""
+        return cls(solver="lm", steps=15, learning_rate=0.5)
 
     @classmethod
     def paper(cls) -> "RefinerConfig":
@@ -174,6 +220,7 @@ class RefinerConfig:
         return cls(
             physics,
             start="measured",
+            righting=0.0,
             optimizer="sgd",
             steps=3000,
             learning_rate=1e-4,

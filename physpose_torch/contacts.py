@@ -216,7 +216,8 @@ def find_static_gaps(
             backend=backend,
         )
         height = torch.where((fall.normal * down).sum(-1) >= SUPPORT_SLOPE, fall.distance, torch.inf)
-        plane_pairs = scene.plane_pairs[falls[scene.image[scene.plane_pairs[:, 0]]]]
+        slope = -(scene.plane_normal[scene.plane_pairs[:, 1]] * scene.gravity[scene.image[scene.plane_pairs[:, 0]]]).sum(-1)
+        plane_pairs = scene.plane_pairs[slope >= SUPPORT_SLOPE]  # and so with gravity; a wall carries nothing
         # all parts of the object against each plane of its image: the nearest part decides which static part is B
         instance, plane = _plane_instances(scene, plane_pairs)
         above = _above_planes(T, scene, instance, plane, None)

@@ -20,11 +20,12 @@ class PosePrior(NamedTuple):
     """Estimates of N objects with their uncertainty, flat."""
 
     measured: Tensor
-    """T̃_camera_object (N, 4, 4) [m]."""
+    """T̃_camera_object (N, 4, 4) [m], depth bias removed."""
     precision: Tensor
     """H = Σ⁻¹ (N, 6, 6), order [t in the camera frame, log(R̃ᵀR) in the object frame]."""
     ray: Tensor
-    """(N, 3) from the camera to the centre of each object's bounds [m]; a depth factor 1 + s shifts it by s times this."""
+    """(N, 3) from the camera to the centre of each object's bounds [m]; a depth factor 1 + s shifts it by s times this. Zero
+    in images without anything static: what their objects have in common is not to be found out there."""
     acts: Tensor
     """(N,) bool; an alternative that pushes nobody has no say in the depth factor either."""
     image: Tensor
@@ -50,6 +51,9 @@ def make_prior(
         InvalidInputError: the covariance has another shape or is not positive definite.
     """
     sigma_common = config.sigma_depth_common if covariance is None else 0.0
+    if config.depth_factor != 1.0:
+        measured = measured.clone()
+        measured[:, :3, 3] *= config.depth_factor
     center = scene.object_center.to(measured)
     ray = (measured[:, :3, :3] @ center[:, :, None])[:, :, 0] + measured[:, :3, 3]
     if covariance is None:
@@ -69,6 +73,8 @@ def make_prior(
         raise InvalidInputError(f"measured_covariance[{row}] ({scene.labels[row]}) is not positive definite")
     precision = torch.cholesky_inverse(factor).to(measured)
     image, acts = scene.image.to(measured.device), acts.to(measured.device)
+    # nothing but collisions would drive all objects away from the camera together, where their rays are farther apart
+    ray = torch.where(scene.has_static.to(image.device)[image, None], ray, 0.0)
     return PosePrior(measured, precision, ray, acts, image, scene.n_images, sigma_common, config.robust)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -11,6 +12,7 @@ from physpose_torch.errors import InvalidInputError
 from physpose_torch.losses import PhysicsLoss, PhysicsTerms, acting, check_poses, flatten_covariance
 from physpose_torch.prior import make_prior
 from physpose_torch.report import PhysicsReport, report_of
+from physpose_torch.righting import right_fallen
 from physpose_torch.scene import Scene
 from physpose_torch.solvers.descent import descend
 from physpose_torch.solvers.lm import levenberg_marquardt
@@ -32,13 +34,16 @@ class Refinement:
     terms: PhysicsTerms
     """Costs (..., N) at the refined poses."""
     trajectory: Tensor | None
-    """(steps + 1, ..., N, 4, 4) if the config keeps it, from the estimates on; the slide out of planes is in the first step."""
+    """(steps + 1, ..., N, 4, 4) if the config keeps it, from the estimates on; removing the depth bias and the slide out of
+    planes are in the first step."""
     steps: Tensor
     """(..., I) steps that each image took."""
     converged: Tensor
     """(..., I) bool: the image came to rest before the step limit."""
     image: Tensor
     """(N,) image of each object, as in the scene."""
+    righted: Tensor
+    """(..., N) bool: objects that could not have stood as they were estimated, and were turned to stand."""
 
     def best(self) -> Tensor:
         """Poses (N, 4, 4) of the hypothesis with the lowest cost, chosen image by image."""
@@ -110,16 +115,35 @@ class PhysPoseRefiner(nn.Module):
             acts = acting(scene, scores).repeat(leading.numel())
             prior = make_prior(measured.reshape(-1, 4, 4), many, acts, covariance, self.config.physics)
             solve = levenberg_marquardt if self.config.solver == "lm" else descend
-            result = solve(prior, many, acts, self.config, callback)
+            solve = partial(solve, config=self.config, callback=callback)
+            result = solve(prior, many, acts)
+            backend = self.config.physics.backend
+            report = report_of(result.poses.reshape(measured.shape), scene, many, acts, backend, result.cost)
+            righted = torch.zeros(len(many), dtype=torch.bool, device=measured.device)
+            if self.config.righting > 0:
+                planes = len(scene) + len(scene.static_bodies)
+                result, righted = right_fallen(
+                    result,
+                    report,
+                    prior,
+                    many,
+                    acts,
+                    solve,
+                    first_plane=planes,
+                    limit=self.config.righting,
+                    backend=backend,
+                )
             refined = result.poses.reshape(measured.shape)
+            if bool(righted.any()):
+                report = report_of(refined, scene, many, acts, backend)
             terms = (x.reshape(measured.shape[:-2]) for x in result.terms)
-            report = report_of(refined, scene, many, acts, self.config.physics.backend, result.cost)
         lengths = ("penetration_static", "penetration_object", "gap")
         report = replace(report, **{name: getattr(report, name).to(poses.dtype) for name in lengths})
         images = (*leading, scene.n_images)
         trajectory = result.trajectory
         if trajectory is not None:
             trajectory = trajectory.reshape(len(trajectory), *measured.shape).to(poses.dtype)
+            trajectory[0] = poses.detach()  # the descent begins where the depth bias is removed
         return Refinement(
             poses=refined.to(poses.dtype),
             report=report,
@@ -128,4 +152,5 @@ class PhysPoseRefiner(nn.Module):
             steps=result.steps.reshape(images),
             converged=result.converged.reshape(images),
             image=scene.image,
+            righted=righted.reshape(measured.shape[:-2]),
         )

@@ -1,6 +1,10 @@
-"""What a robot would ask of a set of poses: how deep objects are inside each other, how high above their support."""
+"""What a robot would ask of a set of poses: how deep objects are in each other, how high above their support, if they stay."""
 
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -9,6 +13,7 @@ from physpose_torch.contacts import find_contacts, find_drops
 from physpose_torch.distance.autograd import chosen_backend
 from physpose_torch.losses import acting, check_poses
 from physpose_torch.scene import Scene
+from physpose_torch.stability import BALANCE, Posed, stability_margin
 
 __all__ = ["PhysicsReport", "physics_report", "report_of"]
 
@@ -32,35 +37,104 @@ class PhysicsReport:
     """What carries it or would: object index, or N + index of a static (bodies first, then planes); -1: nothing."""
     labels: tuple[str, ...]
     """Label of each object."""
+    _carriers: tuple[str, ...] = field(repr=False)
+    """Name of everything that ``support`` may be."""
+    _posed: Posed = field(repr=False)
+    """What stability is worked out of, when it is asked for."""
 
     @property
     def penetration(self) -> Tensor:
         """The deeper of the two penetrations [m]."""
         return torch.maximum(self.penetration_static, self.penetration_object)
 
+    @cached_property
+    def stability_margin(self) -> Tensor:
+        """How far inside its support polygon the centre of mass is, seen along gravity [m]; worked out on first use.
+
+        Negative outside, -inf where nothing carries the object, NaN without gravity. The object is judged where it stands
+        after dropping by its gap; the centre of mass is that of uniform density; a carrier need not be stable itself.
+        """
+        with torch.inference_mode(False), torch.no_grad():
+            return stability_margin(self._posed).reshape(self.gap.shape).to(self.gap)
+
+    @property
+    def stable(self) -> Tensor:
+        """Bool: the object would not tip over. False where nothing carries it, and where gravity is not known."""
+        return self.stability_margin > BALANCE
+
+    @property
+    def supporter(self) -> list[str]:
+        """Label of what carries each object or would, ``plane``, or ``-`` for nothing; flat over (..., N)."""
+        names = (*self._carriers, "-")  # -1 is the last
+        return [names[i] for i in self.support.reshape(-1).tolist()]
+
     @property
     def status(self) -> list[str]:
-        """``penetrating``, ``floating``, ``resting``, ``unsupported`` or ``free`` (no gravity), flat over (..., N)."""
+        """One word for each object, flat over (..., N); the first that fits.
+
+        ``penetrating``, ``free`` (no gravity), ``unsupported`` (nothing below), ``floating``, ``tipping`` (in contact, not
+        stable) or ``resting``.
+        """
         words = []
-        for depth, gap in zip(self.penetration.reshape(-1).tolist(), self.gap.reshape(-1).tolist(), strict=True):
+        columns = (self.penetration, self.gap, self.stable)
+        for depth, gap, stable in zip(*(x.reshape(-1).tolist() for x in columns), strict=True):
             if depth > NOTABLE:
                 words.append("penetrating")
             elif gap != gap:
                 words.append("free")
             elif gap == float("inf"):
                 words.append("unsupported")
+            elif gap > NOTABLE:
+                words.append("floating")
             else:
-                words.append("floating" if gap > NOTABLE else "resting")
+                words.append("resting" if stable else "tipping")
         return words
 
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain Python for JSON, lengths in metres, one entry an object (flat over (..., N)).
+
+        Where there is no number (nothing below, no gravity) it is None; so is ``stable`` without gravity.
+        """
+        lengths = ("penetration_static", "penetration_object", "gap", "stability_margin")
+        columns = {name: [_number(x) for x in getattr(self, name).reshape(-1).tolist()] for name in lengths}
+        unknown = self.gap.isnan().reshape(-1).tolist()
+        stable = self.stable.reshape(-1).tolist()
+        columns = {
+            "label": self._every_label(),
+            **columns,
+            "support": self.supporter,
+            "stable": [None if u else s for u, s in zip(unknown, stable, strict=True)],
+            "status": self.status,
+        }
+        return {"objects": [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]}
+
     def __str__(self) -> str:
-        rows = [f"{'object':20s} {'in static':>10s} {'in object':>10s} {'gap':>8s}  status   [mm]"]
-        columns = (self.penetration_static, self.penetration_object, self.gap)
-        values = [x.reshape(-1).tolist() for x in columns]
-        repeat = len(values[0]) // max(len(self.labels), 1)
-        for label, deep, inside, gap, status in zip(self.labels * repeat, *values, self.status, strict=True):
-            rows.append(f"{label:20s} {1e3 * deep:10.2f} {1e3 * inside:10.2f} {1e3 * gap:8.2f}  {status}")
-        return "\n".join(rows)
+        words = {None: "-", True: "yes", False: "no"}
+        rows = []
+        for o in self.to_dict()["objects"]:
+            lengths = (_mm(o[key]) for key in ("penetration_static", "penetration_object", "gap"))
+            rows.append((o["label"], *lengths, o["support"], words[o["stable"]], o["status"]))
+        header = ("object", "in static", "in object", "gap", "carried by", "stable", "status  [mm]")
+        widths = [max(len(row[i]) for row in (header, *rows)) for i in range(len(header))]
+        numbers = range(1, 4)
+        lines = []
+        for row in (header, *rows):
+            cells = [
+                c.rjust(w) if i in numbers else c.ljust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))
+            ]
+            lines.append("  ".join(cells).rstrip())
+        return "\n".join(lines)
+
+    def _every_label(self) -> Sequence[str]:
+        return self.labels * (self.gap.numel() // max(len(self.labels), 1))
+
+
+def _number(x: float) -> float | None:
+    return x if math.isfinite(x) else None
+
+
+def _mm(x: float | None) -> str:
+    return "-" if x is None else f"{1e3 * x:.2f}"
 
 
 def physics_report(
@@ -108,11 +182,13 @@ def report_of(
     falls = (many.gravity != 0).any(-1)[many.image].to(flat.device)
     gap = torch.where(falls, height, torch.nan)
     support = torch.where(falls, support, -1)
+    posed = Posed.of(flat, many, acts, gap, backend)
     copy = torch.arange(copies, device=flat.device).repeat_interleave(n)
     support = _own_numbers(support, copy, n, len(scene.static_bodies), len(scene.planes), copies)
     shape = poses.shape[:-2]
     in_static, in_object, gap = (x.reshape(shape).to(poses.dtype) for x in (in_static, in_object, gap))
-    return PhysicsReport(in_static, in_object, gap, support.reshape(shape), tuple(scene.labels))
+    carriers = (*scene.labels, *(s.shape.label for s in scene.static_bodies), *("plane" for _ in scene.planes))
+    return PhysicsReport(in_static, in_object, gap, support.reshape(shape), tuple(scene.labels), carriers, posed)
 
 
 def _fused():

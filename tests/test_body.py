@@ -57,6 +57,31 @@ def test_a_mesh_with_holes_is_still_a_body():
     assert torch.allclose(body.upper - body.lower, torch.tensor([0.1, 0.06, 0.04], dtype=torch.float64), atol=1e-6)
 
 
+def test_the_centre_of_mass_of_a_watertight_mesh_is_that_of_its_volume(angle):
+    """A hollow box open at the top: its bounds know nothing of where the walls are."""
+    outer = trimesh.creation.box(bounds=[[-0.05, -0.05, 0], [0.05, 0.05, 0.1]])
+    inner = trimesh.creation.box(bounds=[[-0.04, -0.04, 0.02], [0.04, 0.04, 0.09]])
+    inner.invert()
+    tin = Body("tin", Body.box((0.1, 0.1, 0.1), label="tin").parts, trimesh.util.concatenate([outer, inner]))
+    solid, hollow = 0.1**3, 0.08 * 0.08 * 0.07
+    expected = (solid * 0.05 - hollow * 0.055) / (solid - hollow)
+    assert tin.center_of_mass.tolist() == pytest.approx([0, 0, expected], abs=1e-9)
+    foot, post = 0.09, 0.06
+    x = (foot * 0.045 + post * 0.015) / (foot + post)
+    z = (foot * 0.015 + post * 0.06) / (foot + post)
+    assert angle.center_of_mass.tolist() == pytest.approx([x, 0.015, z], abs=1e-9)
+
+
+def test_the_centre_of_mass_of_a_mesh_with_holes_is_that_of_its_parts(angle):
+    torn = trimesh.Trimesh(angle.mesh.vertices, angle.mesh.faces[1:], process=False)
+    body = Body("torn", angle.parts, torn)
+    assert not torn.is_volume
+    assert torch.allclose(body.center_of_mass, angle.center_of_mass)
+    inside_out = angle.mesh.copy()
+    inside_out.invert()
+    assert torch.allclose(Body("inverted", angle.parts, inside_out).center_of_mass, angle.center_of_mass)
+
+
 def test_symmetries_are_kept_and_checked():
     half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
     mesh = trimesh.creation.box((0.1, 0.06, 0.04))

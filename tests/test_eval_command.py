@@ -224,7 +224,8 @@ def test_estimates_behind_the_camera_or_off_the_image_score_nothing(root, run, z
 def test_what_is_in_the_table_is_counted(root, run):
     planes = ("--planes", root / "planes.json", "--vsd-depth", "none")
     _, text, scores = run(rows(), *planes)
-    assert scores["inside_table"] == {"count": 4, "estimates": 0.0, "above": 0.0, "ground_truth": 0.0}
+    assert scores["inside_table"].pop("count") == 4
+    assert set(scores["inside_table"].values()) == {0.0}
     assert "more than 3 mm inside the table: 0.0 %" in text
     _, _, scores = run(rows(lambda T: T - 5 * np.outer([*UP, 0], [0, 0, 0, 1])), *planes)
     assert scores["inside_table"]["estimates"] == 1

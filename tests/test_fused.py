@@ -789,7 +789,7 @@ def test_only_alternatives_of_one_object(table, box):
         ({"smoothing": Smoothing("none")}, FusedCost),
         ({"smoothing": Smoothing("gumbel")}, GeneralCost),
         ({"smoothing": Smoothing("pose")}, GeneralCost),
-        ({"gravity": "paper"}, GeneralCost),
+        ({"gravity": "paper"}, FusedCost),
         ({"backend": "fcl"}, GeneralCost),
     ],
     ids=str,

@@ -1,5 +1,7 @@
 """The report's numbers by hand, and the words made of them."""
 
+import dataclasses
+import json
 import math
 
 import pytest
@@ -7,6 +9,7 @@ import torch
 
 from physpose_torch.errors import InvalidInputError
 from physpose_torch.geometry.body import Body
+from physpose_torch.refiner import PhysPoseRefiner
 from physpose_torch.report import physics_report
 from physpose_torch.scene import Scene, Static
 
@@ -94,9 +97,68 @@ def test_the_text_has_a_line_for_each_object_in_millimetres(table, box, can):
     poses = table.poses((0, 0, 0.015), (0.3, 0, 0.047))
     lines = str(physics_report(poses, scene)).splitlines()
     assert len(lines) == 3
-    assert lines[1].split() == ["box", "5.00", "0.00", "0.00", "penetrating"]
-    assert lines[2].split() == ["can", "0.00", "0.00", "7.00", "floating"]
+    assert lines[1].split() == ["box", "5.00", "0.00", "0.00", "plane", "yes", "penetrating"]
+    assert lines[2].split() == ["can", "0.00", "0.00", "7.00", "plane", "yes", "floating"]
+    assert lines[0].index("carried by") == lines[1].index("plane") == lines[2].index("plane")
+    assert lines[0].index("gap") + 3 == lines[1].index("0.00  plane") + 4
     assert len(str(physics_report(poses.expand(3, 2, 4, 4), scene)).splitlines()) == 7
+
+
+def test_what_is_unknown_or_endless_is_a_dash_in_the_text(table, box):
+    free = physics_report(table.poses((0, 0, 0.5)), Scene([box], [Static(table.plane)]))
+    assert str(free).splitlines()[1].split() == ["box", "0.00", "0.00", "-", "-", "-", "free"]
+    slab = Static(Body.box((0.1, 0.1, 0.1), label="slab"), table.at(0.5, 0, 0))
+    unsupported = physics_report(table.poses((0, 0, 0.5)), Scene([box], [slab], gravity=table.gravity))
+    assert str(unsupported).splitlines()[1].split() == ["box", "0.00", "0.00", "-", "-", "no", "unsupported"]
+
+
+@pytest.mark.parametrize("leading", [(), (2,), (2, 3)], ids=str)
+def test_what_carries_an_object_has_a_name(leading, table, box, can):
+    slab = Static(Body.box((0.2, 0.2, 0.05), label="slab"), table.at(0, 0.4, 0.025))
+    scene = Scene([box, can, can], [Static(table.plane), slab], gravity=table.gravity)
+    poses = table.poses((0, 0, 0.02), (0, 0, 0.08), (0, 0.4, 0.09)).expand(*leading, 3, 4, 4)
+    assert physics_report(poses, scene).supporter == ["plane", "box", "slab"] * math.prod(leading)
+
+
+def test_an_object_in_contact_that_would_fall_over_is_tipping(table, box, can):
+    """The can stands 10 mm beyond the edge of the box; sunk in or in the air it is called that first."""
+    x = 0.05 + 0.01
+    for height, word in ((0.08, "tipping"), (0.077, "penetrating"), (0.084, "floating")):
+        report = physics_report(table.poses((0, 0, 0.02), (x, 0, height)), Scene.tabletop([box, can], table.plane))
+        assert report.status[1] == word
+        assert report.stable.tolist() == [True, False]
+
+
+def test_as_a_dict_it_is_plain_numbers_in_metres_that_json_can_hold(table, box):
+    slab = Static(Body.box((0.1, 0.1, 0.1), label="slab"), table.at(0.5, 0, 0))
+    scene = Scene([box, box], [Static(table.plane), slab], gravity=table.gravity)
+    first, second = physics_report(table.poses((0, 0, 0.015), (0, 0.3, 0.03)), scene).to_dict()["objects"]
+    assert first["label"] == "box"
+    assert first["penetration_static"] == pytest.approx(0.005, abs=1e-9)
+    assert first["stability_margin"] == pytest.approx(0.03, abs=1e-6)
+    assert (first["support"], first["stable"], first["status"]) == ("plane", True, "penetrating")
+    assert second["gap"] == pytest.approx(0.01, abs=1e-9)
+    nowhere = physics_report(table.poses((0, 0, 0.5)), Scene([box], [slab], gravity=table.gravity)).to_dict()
+    free = physics_report(table.poses((0, 0, 0.5)), Scene([box])).to_dict()
+    json.dumps([nowhere, free], allow_nan=False)
+    assert nowhere["objects"][0]["gap"] is None
+    assert nowhere["objects"][0]["stable"] is False
+    assert free["objects"][0]["stable"] is None
+
+
+def test_a_report_with_other_numbers_is_as_stable(table, box):
+    """The refiner replaces lengths by those of the caller's precision."""
+    report = physics_report(table.poses((0, 0, 0.02)), Scene.tabletop([box], table.plane))
+    other = dataclasses.replace(report, gap=report.gap.float())
+    assert other.stable.tolist() == [True]
+    assert other.stability_margin.dtype == torch.float32
+
+
+def test_the_report_of_a_refinement_knows_stability(table, box):
+    refined = PhysPoseRefiner()(table.poses((0, 0, 0.01)).float(), Scene.tabletop([box], table.plane))
+    assert refined.report.stable.tolist() == [True]
+    assert "stability_margin" in vars(refined.report)
+    assert "stability_margin" not in vars(PhysPoseRefiner()(table.poses((0, 0, 0.01)), Scene([box])).report)
 
 
 def test_an_empty_scene_has_an_empty_report(table):

@@ -6,27 +6,44 @@ from typing import Annotated, Any, Union
 
 import tyro
 
+from physpose_torch.bop.calibration import read_calibration
+from physpose_torch.commands.ablate import Ablate
+from physpose_torch.commands.calibrate import Calibrate
 from physpose_torch.commands.decompose import Decompose
 from physpose_torch.commands.demo import Demo
 from physpose_torch.commands.eval import Eval
 from physpose_torch.commands.refine import Refine
+from physpose_torch.commands.report import Report
 from physpose_torch.config import RefinerConfig
 from physpose_torch.errors import InvalidInputError
 
 __all__ = ["parse"]
 
-COMMANDS = {"demo": Demo, "refine": Refine, "eval": Eval, "decompose": Decompose}
+COMMANDS = {
+    "demo": Demo,
+    "refine": Refine,
+    "report": Report,
+    "eval": Eval,
+    "calibrate": Calibrate,
+    "ablate": Ablate,
+    "decompose": Decompose,
+}
 PRESETS = {"default": RefinerConfig, "lm": RefinerConfig.lm, "paper": RefinerConfig.paper}
 
 
 def parse(args: Sequence[str]) -> Any:
-    """The command that the arguments name, ready to be called. Single options start from the preset that is asked for."""
-    config = PRESETS[_preset(args)]()
+    """The command that the arguments name, ready to be called. Single options start from the preset and the
+    calibration that are asked for."""
+    preset, calibration = _preset(args), _value(args, "--calibration")
+    config = PRESETS[preset]()
     choices = []
     for name, command in COMMANDS.items():
         options = {}
         if "config" in command.__dataclass_fields__:
-            options["default"] = _with_defaults(command, preset=_preset(args), config=config)
+            own = config
+            if command is Refine and calibration is not None and args[0] == name:
+                own = config.calibrated(read_calibration(calibration))
+            options["default"] = _with_defaults(command, preset=preset, config=own)
         choices.append(Annotated[command, tyro.conf.subcommand(name, **options)])
     return tyro.cli(
         Union[tuple(choices)],  # noqa: UP007
@@ -38,16 +55,23 @@ def parse(args: Sequence[str]) -> Any:
 
 
 def _preset(args: Sequence[str]) -> str:
-    """What follows --preset; it decides the defaults of the other options, so it is read before them."""
+    """It decides the defaults of the other options, so it is read before them, like the calibration."""
+    preset = _value(args, "--preset")
+    if preset is None:
+        return "default"
+    if preset not in PRESETS:
+        raise InvalidInputError(f"--preset {preset}: expected one of {', '.join(PRESETS)}")
+    return preset
+
+
+def _value(args: Sequence[str], option: str) -> str | None:
+    """What follows an option, if it is there."""
     for i, word in enumerate(args):
-        value = word.removeprefix("--preset=") if word.startswith("--preset=") else None
-        if word == "--preset" and i + 1 < len(args):
-            value = args[i + 1]
-        if value is not None:
-            if value not in PRESETS:
-                raise InvalidInputError(f"--preset {value}: expected one of {', '.join(PRESETS)}")
-            return value
-    return "default"
+        if word.startswith(f"{option}="):
+            return word.removeprefix(f"{option}=")
+        if word == option and i + 1 < len(args):
+            return args[i + 1]
+    return None
 
 
 def _with_defaults(command: type, **values: Any) -> Any:

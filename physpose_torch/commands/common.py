@@ -42,6 +42,8 @@ def describe(summary: dict[str, Any]) -> str:
         f"{summary['refined']} of {summary['images']} images refined, {summary['rows']} poses, "
         f"{1000 * summary['seconds_per_image']:.0f} ms an image"
     )
+    if summary["righted"]:
+        head += f"\n{summary['righted']} of them could not have stood as estimated, and were turned"
     lines = [head, "", table(["", "before", "after"], rows)]
     if summary["problems"]:
         lines += ["", f"{summary['images'] - summary['refined']} images kept their poses; see the messages below"]

@@ -21,7 +21,7 @@ class Demo:
     seed: int = 1
     """Which arrangement."""
     preset: str = "default"
-    """default; lm: the same cost by ten Gauss-Newton steps; or paper: the paper's cost, weights and plain gradient descent."""
+    """default; lm: the same cost by fifteen Gauss-Newton steps; or paper: the paper's cost and gradient descent."""
     config: RefinerConfig = field(default_factory=RefinerConfig)
     """Single options, starting from the preset."""
     quiet: bool = False

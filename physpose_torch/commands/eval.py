@@ -202,6 +202,7 @@ def inside_table(
         "estimates": share(est_height < -INSIDE),
         "above": share(est_height > INSIDE),
         "ground_truth": share(gt_height < -INSIDE),
+        "ground_truth_above": share(gt_height > INSIDE),
     }
 
 
@@ -212,5 +213,5 @@ def inside_text(c: dict[str, Any]) -> str:
         f"Best-scored estimates of objects standing on the plane: {c['count']}\n"
         f"(ground truth within {1e3 * STANDING:.0f} mm of it)\n"
         f"{limit} inside the table: {100 * c['estimates']:.1f} % (ground truth itself {100 * c['ground_truth']:.1f} %)\n"
-        f"{limit} above it: {100 * c['above']:.1f} %"
+        f"{limit} above it: {100 * c['above']:.1f} % (ground truth itself {100 * c['ground_truth_above']:.1f} %)"
     )

@@ -38,7 +38,7 @@ class ImageOptions:
     """BOP dataset folder."""
     planes: Path | None = None
     """Table planes: {scene: {image: {"normal": [3], "offset_mm": x}}} or {"R": 3x3, "t": [m]}. Without: collisions only."""
-    plane_sigma_mm: float = 2.5
+    plane_sigma_mm: float = 2.0
     """Standard deviation of the height of planes whose entry states none; contacts are as soft. 0: they are exact. Scans,
     true poses and tables agree to a few mm, not better."""
     statics: Path | None = None

@@ -37,9 +37,11 @@ class Refine(ImageOptions):
     out: Path
     """Result file to write."""
     preset: str = "default"
-    """default; lm: the same cost by ten Gauss-Newton steps; or paper: the paper's cost, weights and plain gradient descent."""
+    """default; lm: the same cost by fifteen Gauss-Newton steps; or paper: the paper's cost and gradient descent."""
+    calibration: Path | None = None
+    """The estimator's bias and spread, by physpose calibrate; without: what RGB estimators are usually like."""
     config: RefinerConfig = field(default_factory=RefinerConfig)
-    """Single options, starting from the preset."""
+    """Single options, starting from preset and calibration."""
     json: Path | None = None
     """Write penetration and gap before and after, and what could not be refined, to this file."""
     quiet: bool = False
@@ -52,6 +54,7 @@ class Refine(ImageOptions):
         seconds = np.zeros(len(estimates))
         before, after = _Summary(), _Summary()
         images: list[ImageScene] = []
+        righted = 0
         with progress(total, "refine", "image", quiet=self.quiet) as bar:
             for batch in in_batches(todo, self.batch):
                 for group in self._run([i for i in batch if i.scene is not None], estimates, refiner):
@@ -60,6 +63,7 @@ class Refine(ImageOptions):
                     seconds[rows] = group.seconds / len(group.images)
                     before.add(group.before)
                     after.add(group.after)
+                    righted += group.righted
                 for image in batch:
                     image.scene = None  # its memory is needed for the next ones
                 images += batch
@@ -71,6 +75,7 @@ class Refine(ImageOptions):
             "images": len(images),
             "refined": len(refined),
             "rows": int(sum(len(i.rows) for i in refined)),
+            "righted": righted,
             "seconds_per_image": float(sum(seconds[i.rows[0]] for i in refined) / max(len(refined), 1)),
             "before": before.figures(),
             "after": after.figures(),
@@ -104,6 +109,7 @@ class _Group:
     seconds: float
     before: PhysicsReport
     after: PhysicsReport
+    righted: int
 
 
 def _refine(images: Sequence[ImageScene], estimates: Estimates, refiner: PhysPoseRefiner) -> _Group:
@@ -112,7 +118,7 @@ def _refine(images: Sequence[ImageScene], estimates: Estimates, refiner: PhysPos
     measured, scores = poses_of(images, estimates)
     before = physics_report(measured, scene, scores=scores, backend=refiner.config.physics.backend)
     result = refiner(measured, scene, scores=scores)
-    return _Group(images, result.poses, time.perf_counter() - start, before, result.report)
+    return _Group(images, result.poses, time.perf_counter() - start, before, result.report, int(result.righted.sum()))
 
 
 class _Summary:

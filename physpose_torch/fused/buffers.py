@@ -120,7 +120,7 @@ def make_state(
     counters = {
         "still": images,
         **dict.fromkeys(("plane_best", "plane_instance", "support"), n),
-        **dict.fromkeys(("row_count", "row_onto_a", "row_onto_b"), rows),
+        **dict.fromkeys(("row_count", "row_touches", "row_onto_a", "row_onto_b"), rows),
     }
     tensors = {name: torch.zeros(shape, **real) for name, shape in shapes.items()}
     tensors |= {name: torch.zeros(size, **whole) for name, size in counters.items()}

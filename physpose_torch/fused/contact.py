@@ -1,4 +1,4 @@
-"""What touches: objects against planes, rows of parts against each other, and how far each can fall onto the other."""
+"""What touches: rows of parts against each other, and how far each can fall onto the other."""
 
 import functools
 from types import SimpleNamespace
@@ -26,7 +26,7 @@ def contact(real: type) -> SimpleNamespace:
     vec3, mat33, Parts, Wobble = s.vec3, s.mat33, s.Parts, m.Wobble
     rotation, translation, orthonormal = s.rotation, s.translation, s.orthonormal
     make_pair, across = s.make_pair, s.across
-    distance, fall, smoothed, moments, basis, Points = p.distance, p.fall, m.smoothed, m.moments, m.basis, m.Points
+    distance, fall, smoothed, Points = p.distance, p.fall, m.smoothed, m.Points
     World, Options, State, vec6, mat66 = w.World, w.Options, w.State, w.vec6, w.mat66
     join, hinge, hinge_slope = w.join, w.hinge, w.hinge_slope
     lands, apart = boxes(real).lands, boxes(real).apart
@@ -35,94 +35,9 @@ def contact(real: type) -> SimpleNamespace:
     support_slope = real(SUPPORT_SLOPE)
 
     @wp.func
-    def plane_softness(world: World, state: State, options: Options, weight: real, i: wp.int32, plane: wp.int32):
-        """ζσ² of the plane's height at an object, at least the usual softness: ζ d²/2w is d²/2σ² then."""
-        frame = basis(world.plane_normal[plane])
-        origin = rotation(state.poses[i]) * world.center[i] + translation(state.poses[i])
-        lever = frame * (origin - state.middle[world.image[i]])
-        j = vec3(lever[0], lever[1], one)
-        return wp.max(options.softness, weight * wp.dot(j, world.plane_covariance[plane] * j))
-
-    @wp.func
-    def lowest_point(parts: Parts, part: wp.int32, down: vec3, wobble: Wobble, smoothing: wp.int32):
-        """Where a part touches what lies across ``down``, in its body's frame."""
-        if smoothing <= 0:
-            return parts.vertices[s.farthest(parts, part, down)]
-        frame = basis(down)
-        x = moments(parts, part, wp.identity(n=3, dtype=real), frame, wobble)
-        return wp.transpose(frame) * x.mean
-
-    @wp.kernel(enable_backward=False, module=module)
-    def planes(parts: Parts, world: World, state: State, options: Options, wobble: Wobble):
-        """Each object against the planes of its image: what is inside, and how high it is above the nearest."""
-        i = wp.tid()
-        image = world.image[i]
-        if state.done[image] == 1:
-            return
-        R = rotation(state.poses[i])
-        t = translation(state.poses[i])
-        cost = zero
-        gradient = vec6()
-        curvature = mat66()
-        depth = zero
-        best = far
-        best_plane = int(-1)
-        best_instance = int(-1)
-        for k in range(world.object_plane_start[i], world.object_plane_start[i + 1]):
-            plane = world.object_plane[k]
-            normal = world.plane_normal[plane]
-            up = wp.transpose(R) * normal
-            level = wp.dot(normal, t) - world.plane_offset[plane]
-            softness = plane_softness(world, state, options, options.collision_weight, i, plane)
-            count = zero
-            sum = zero
-            force = zero
-            torque = vec3(zero, zero, zero)
-            block = mat66()
-            lowest = far
-            lowest_instance = int(-1)
-            for q in range(world.instance_start[i], world.instance_start[i + 1]):
-                part = world.instance_part[q]
-                height = level + wp.dot(up, parts.vertices[s.farthest(parts, part, -up)])
-                if height < lowest:
-                    lowest = height
-                    lowest_instance = q
-                    depth = wp.max(depth, -height)
-                if height < zero:
-                    count += one
-                    sum += hinge(-height, softness)
-                    slope = hinge_slope(-height, softness)
-                    point = lowest_point(parts, part, -up, wobble, options.smooth)
-                    force -= slope
-                    torque -= slope * wp.cross(point, up)
-                    if options.newton == 1:
-                        j = join(normal, wp.cross(point, up))
-                        block += slope / -height * wp.outer(j, j)
-            if count > zero:
-                cost += sum / count
-                gradient += join(force / count * normal, torque / count)
-                if options.newton == 1:
-                    curvature += (one / count) * block
-            slope = -wp.dot(normal, world.gravity[image])
-            if slope >= support_slope:
-                above = wp.max(lowest, zero) / slope
-                if above <= options.reach and above < best:
-                    best = above
-                    best_plane = plane
-                    best_instance = lowest_instance
-        state.plane_cost[i] = cost
-        state.plane_depth[i] = depth
-        state.plane_gradient[i] = gradient
-        if options.newton == 1:
-            state.plane_curvature[i] = curvature
-        state.plane_height[i] = best
-        state.plane_best[i] = best_plane
-        state.plane_instance[i] = best_instance
-
-    @wp.func
     def may_fall(world: World, state: State, options: Options, who: wp.int32, onto: wp.int32):
         """How far down it is worth looking for what carries an entity; 0: not at all."""
-        if who >= world.n_objects or options.gravity_weight == zero:
+        if who >= world.n_objects or options.gravity_weight == zero or options.paper == 1:
             return zero
         if world.falls[world.image[who]] == 0:
             return zero
@@ -155,16 +70,18 @@ def contact(real: type) -> SimpleNamespace:
         state.row_cost[r] = zero
         state.row_count[r] = 0
         state.row_depth[r] = zero
+        state.row_touches[r] = 0
         state.row_drop_a[r] = far
         state.row_drop_b[r] = far
         travelled = state.moved[a] + state.moved[b]
         # a fall is never shorter than the distance
-        if state.clear[r] - travelled > wp.max(limit_a, limit_b):
+        limit = wp.max(wp.max(limit_a, limit_b), options.margin)
+        if state.clear[r] - travelled > limit:
             return
         low = state.lower[i]
         high = state.upper[i]
         clear = apart(low, high, state.entity_lower[b], state.entity_upper[b])
-        if clear > wp.max(limit_a, limit_b):
+        if clear > limit:
             state.clear[r] = clear + travelled
             return
         clear = far
@@ -193,7 +110,7 @@ def contact(real: type) -> SimpleNamespace:
             slot = world.row_slot[r] + j - world.instance_start[b]
             known = state.slot_clear[slot] - travelled
             aside = state.slot_aside[slot] - travelled
-            if known > wp.max(best_a, best_b) or aside > zero:
+            if known > wp.max(wp.max(best_a, best_b), options.margin) or aside > options.margin:
                 clear = wp.min(clear, wp.max(known, aside))
                 continue
             aside = zero
@@ -203,7 +120,7 @@ def contact(real: type) -> SimpleNamespace:
             part_b = world.instance_part[j]
             inside = int(0)
             normal = vec3(zero, zero, zero)
-            if gap <= reached:
+            if gap <= wp.max(reached, options.margin):
                 both = make_pair(part_a, part_b, R, t)
                 hint = state.slot_normal[slot]
                 if wp.dot(hint, hint) == zero:
@@ -211,12 +128,14 @@ def contact(real: type) -> SimpleNamespace:
                 overlapping = int(0)
                 if state.slot_clear[slot] == -one:
                     overlapping = 1
-                d = distance(parts, both, hint, overlapping, zero, wp.where(options.smooth == 0, 1, 0))
+                d = distance(parts, both, hint, overlapping, options.margin, wp.where(options.smooth == 0, 1, 0))
                 gap = d.value
                 state.slot_normal[slot] = d.normal
                 if gap <= reached:
                     inside = 1
                     normal = R_a * d.normal
+                if gap < options.margin:
+                    state.row_touches[r] = 1
                 if gap < zero:
                     point = Points()
                     point.a = d.a

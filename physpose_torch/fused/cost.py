@@ -167,6 +167,9 @@ class FusedCost(_Fused):
             setattr(options, name, getattr(physics, name))
         options.softness = max(options.softness, 1e-30)  # the paper's hinge, without a division by zero
         options.reach, options.tolerance, options.max_step = physics.gravity_reach, config.tolerance, config.max_step
+        if physics.gravity == "paper":
+            options.paper, options.margin = 1, physics.contact_tolerance
+            options.reach = FAR / 2  # it pulls from any height, but not towards nothing
         options.max_gradient = FAR if config.max_gradient is None else config.max_gradient
         options.smooth, options.newton, options.damping = int(smoothing is not None), int(lm), config.damping
         options.still_steps = LM_STILL_STEPS if lm else STILL_STEPS
@@ -176,9 +179,14 @@ class FusedCost(_Fused):
 
     @staticmethod
     def fits(config: RefinerConfig, scene: Scene) -> bool:
-        """Whether the kernels know this cost, and remember all pairs of parts in the memory that there is."""
+        """Whether the kernels know this cost, and remember all pairs of parts in the memory that there is.
+
+        They know the paper's gravity above planes only, not above static bodies, and not its curvature.
+        """
         physics = config.physics
-        known = physics.gravity == "support" and physics.smoothing.kind in ("ring", "gaussian", "none")
+        known = physics.smoothing.kind in ("ring", "gaussian", "none")
+        if physics.gravity == "paper":
+            known = known and config.solver == "descent" and len(scene.entity_image) == len(scene)
         return known and remembers(scene)
 
     @property

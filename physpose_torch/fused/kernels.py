@@ -10,6 +10,7 @@ from types import SimpleNamespace
 from physpose_torch.fused.boxes import boxes
 from physpose_torch.fused.contact import contact
 from physpose_torch.fused.objects import objects
+from physpose_torch.fused.planes import planes
 from physpose_torch.fused.prior import prior
 from physpose_torch.fused.step import step
 from physpose_torch.fused.world import world
@@ -21,6 +22,6 @@ __all__ = ["cost_kernels"]
 def cost_kernels(real: type) -> SimpleNamespace:
     """Structs and kernels in ``wp.float32`` or ``wp.float64``."""
     out = SimpleNamespace()
-    for factory in (world, boxes, prior, contact, step, objects):
+    for factory in (world, boxes, prior, planes, contact, step, objects):
         vars(out).update(vars(factory(real)))
     return out

@@ -8,6 +8,7 @@ import warp as wp
 from physpose_torch.distance.kernels.shapes import shapes
 from physpose_torch.distance.kernels.smooth import smooth
 from physpose_torch.fused.contact import contact
+from physpose_torch.fused.planes import planes
 from physpose_torch.fused.step import step
 from physpose_torch.fused.world import world
 
@@ -17,14 +18,14 @@ __all__ = ["objects"]
 @functools.cache
 def objects(real: type) -> SimpleNamespace:
     """Kernels in ``wp.float32`` or ``wp.float64``."""
-    s, m, w, touch = shapes(real), smooth(real), world(real), contact(real)
+    s, m, w, flat = shapes(real), smooth(real), world(real), planes(real)
     vec3, Parts, Wobble, smoothed = s.vec3, s.Parts, m.Wobble, m.smoothed
     rotation, translation, orthonormal, make_pair = s.rotation, s.translation, s.orthonormal, s.make_pair
     World, Prior, Options, State, vec6, mat66 = w.World, w.Prior, w.Options, w.State, w.vec6, w.mat66
     join, hinge, hinge_slope = w.join, w.hinge, w.hinge_slope
-    plane_softness, lowest_point, fall_of = touch.plane_softness, touch.lowest_point, touch.fall_of
+    plane_softness, lowest_point, fall_of = flat.plane_softness, flat.lowest_point, contact(real).fall_of
     cholesky, solve = step(real).cholesky, step(real).solve
-    module, zero, half, two = w.module, w.zero, w.half, w.two
+    module, zero, one, half, two = w.module, w.zero, w.one, w.half, w.two
 
     @wp.kernel(enable_backward=False, module=module)
     def objects(parts: Parts, world: World, prior: Prior, state: State, options: Options, wobble: Wobble):
@@ -57,6 +58,7 @@ def objects(real: type) -> SimpleNamespace:
             first = world.pair_first[pair]
             second = world.pair_second[pair]
             count = int(0)
+            touches = int(0)
             cost = zero
             force = vec3(zero, zero, zero)
             torque = vec3(zero, zero, zero)
@@ -75,7 +77,9 @@ def objects(real: type) -> SimpleNamespace:
                         torque += state.row_torque_b[r]
                         if options.newton == 1:
                             block += state.row_curvature_b[r]
-                if first == i:
+                if options.paper == 1:
+                    touches = wp.max(touches, state.row_touches[r])
+                elif first == i:
                     if state.row_drop_a[r] < height:
                         height = state.row_drop_a[r]
                         own_instance = world.row_instance[r]
@@ -86,7 +90,7 @@ def objects(real: type) -> SimpleNamespace:
                     own_instance = state.row_onto_b[r]
                     other_instance = world.row_instance[r]
                     other = first
-            if count > 0:
+            if count > 0 or touches == 1:
                 # a contact acts on a body unless the other one is an alternative that pushes nobody
                 partner = second
                 if second == i:
@@ -98,7 +102,9 @@ def objects(real: type) -> SimpleNamespace:
                     partner_moves = world.acts[i]
                 else:
                     partner_moves = 0
-                if moves == 1:
+                if touches == 1 and moves == 1:
+                    height = zero
+                if count > 0 and moves == 1:
                     cost = cost / real(count)
                     collision += cost
                     if partner_moves == 1:
@@ -118,8 +124,17 @@ def objects(real: type) -> SimpleNamespace:
                 plane = state.plane_best[i]
                 softness = plane_softness(world, state, options, options.gravity_weight, i, plane)
                 up = wp.transpose(R) * world.plane_normal[plane]
-                point = lowest_point(parts, world.instance_part[own_instance], -up, wobble, options.smooth)
                 rate = -wp.dot(world.plane_normal[plane], g)
+                begin = own_instance
+                end = own_instance + 1
+                if options.paper == 1:
+                    rate = one
+                    begin = world.instance_start[i]
+                    end = world.instance_start[i + 1]
+                point = vec3(zero, zero, zero)
+                for q in range(begin, end):
+                    point += lowest_point(parts, world.instance_part[q], -up, wobble, options.smooth)
+                point = point / real(end - begin)
                 slope = options.gravity_weight * hinge_slope(height, softness) / rate
                 gradient += slope * join(world.plane_normal[plane], wp.cross(point, up))
                 if options.newton == 1:

@@ -71,7 +71,7 @@ def step(real: type) -> SimpleNamespace:
         if state.done[image] == 1:
             return
         shift = zero
-        if prior.sigma_common > zero:
+        if prior.sigma_common > zero and options.pose_weight > zero:
             numerator = zero
             denominator = options.pose_weight * state.information[image]
             for k in range(world.image_start[image], world.image_start[image + 1]):

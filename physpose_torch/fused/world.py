@@ -75,6 +75,10 @@ def world(real: type) -> SimpleNamespace:
         pose_weight: real
         collision_weight: real
         gravity_weight: real
+        paper: wp.int32
+        """Whether gravity is the paper's: the mean height of an object's parts above a plane, and none in contact."""
+        margin: real
+        """Parts nearer than this count as in contact then; else 0."""
         reach: real
         softness: real
         max_gradient: real
@@ -114,6 +118,7 @@ def world(real: type) -> SimpleNamespace:
         plane_curvature: wp.array(dtype=mat66)
         plane_depth: wp.array(dtype=real)
         plane_height: wp.array(dtype=real)
+        """How far each object falls onto a plane; in the paper's form the mean height of its parts above one."""
         plane_best: wp.array(dtype=wp.int32)
         plane_instance: wp.array(dtype=wp.int32)
         clear: wp.array(dtype=real)
@@ -127,6 +132,8 @@ def world(real: type) -> SimpleNamespace:
         row_cost: wp.array(dtype=real)
         row_count: wp.array(dtype=wp.int32)
         row_depth: wp.array(dtype=real)
+        row_touches: wp.array(dtype=wp.int32)
+        """Whether any pair of a row's parts is nearer than the margin."""
         row_force: wp.array(dtype=vec3)
         row_torque_a: wp.array(dtype=vec3)
         row_torque_b: wp.array(dtype=vec3)

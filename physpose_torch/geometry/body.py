@@ -106,6 +106,18 @@ class Body:
         """Largest distance of a surface point from :attr:`center` [m]."""
         return float(np.linalg.norm(self.mesh.vertices - self.center.numpy(), axis=1).max())
 
+    @cached_property
+    def center_of_mass(self) -> Tensor:
+        """(3,) centre of mass at uniform density [m].
+
+        Of the volume that the mesh encloses; of the convex parts, which overlap a little, if the mesh has holes.
+        """
+        if self.mesh.is_volume:  # watertight, consistently wound and not inside out
+            return torch.tensor(self.mesh.center_mass, dtype=torch.float64)
+        solids = self.parts.to_trimesh()
+        volume = [solid.volume for solid in solids]
+        return torch.tensor(np.average([solid.center_mass for solid in solids], axis=0, weights=volume))
+
     def __repr__(self) -> str:
         size = " × ".join(f"{1000 * e:.0f}" for e in self.upper - self.lower)
         return f"Body({self.label!r}, {self.parts.n_parts} parts, {size} mm)"

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from physpose_torch.config import RefinerConfig
-from physpose_torch.contacts import object_heights
+from physpose_torch.contacts import object_heights, plane_variance
 from physpose_torch.distance.autograd import chosen_backend
 from physpose_torch.errors import InvalidInputError
 from physpose_torch.losses import PhysicsTerms
@@ -169,12 +169,13 @@ def out_of_planes(prior: PosePrior, scene: Scene) -> Tensor:
     poses = prior.measured.clone()
     if not len(scene.planes):
         return poses
-    height = object_heights(poses, scene)
     who, plane = scene.plane_pairs.to(poses.device).unbind(1)
+    # what lies no deeper than the plane may be off can stay
+    height = object_heights(poses, scene) + plane_variance(poses, scene, who, plane, prior.acts).sqrt()
     slope = -(scene.plane_normal.to(poses)[plane] * torch.nn.functional.normalize(prior.ray, dim=-1)[who]).sum(-1)
     slide = torch.where(slope > LEAST_SLOPE, (-height).clamp_min(0.0) / slope.clamp_min(LEAST_SLOPE), 0.0)
     slide = poses.new_zeros(len(poses)).scatter_reduce(0, who, slide, "amax")
-    range_ = torch.linalg.vector_norm(prior.ray, dim=-1)
+    range_ = torch.linalg.vector_norm(prior.ray, dim=-1).clamp_min(torch.finfo(poses.dtype).tiny)
     slide = torch.where(slide < 0.9 * range_, slide, 0.0)  # never behind the camera
     poses[:, :3, 3] -= (slide / range_)[:, None] * prior.ray
     return poses
