@@ -269,10 +269,9 @@ def with_solver(config: RefinerConfig, solver: Literal["descent", "lm"]) -> Refi
 
 
 def _lm_knows(config: RefinerConfig) -> bool:
-    """Without a pose cost the depth factor that an image's estimates share has no curvature to be solved with."""
     physics = config.physics
     kinds = ("ring", "gaussian", "none")
-    return physics.pose_weight > 0 and physics.gravity == "support" and physics.smoothing.kind in kinds
+    return physics.gravity == "support" and physics.smoothing.kind in kinds
 
 
 def choose(variants: list[Variant], names: tuple[str, ...] = (), *, slow: bool = False) -> list[Variant]:

@@ -72,12 +72,16 @@ def find_fallen(
             cosine, best = (local[rows] @ rest.mT).max(1)
             tilt[rows], target[rows] = torch.arccos(cosine.clamp(-1.0, 1.0)), rest[best]
     doubtful = (tilt > ASKEW) & (tilt <= limit) & (gap <= NEAR)  # NaN without gravity
+    if bool(doubtful.any()):
+        # most images have nothing to look at
+        part, here = scene.select(scene.image[doubtful.cpu()].unique())
+        at = here.to(poses.device)
+        posed = Posed.of(poses[at], part, acts[here], (gap - bedded)[at], backend)
+        margin = stability_margin(posed, only=doubtful[at], tolerance=TOLERANCE, tilt=TILT)
+        falls = doubtful[at] & (margin <= BALANCE)
+        falls &= ~_leans(poses[at], part, acts[here], falls, backend)
+        doubtful = torch.zeros_like(doubtful).index_put((at,), falls)
     rows = doubtful.nonzero()[:, 0]
-    if len(rows):
-        posed = Posed.of(poses, scene, acts, gap - bedded, backend)
-        margin = stability_margin(posed, only=doubtful, tolerance=TOLERANCE, tilt=TILT)
-        falls = doubtful & (margin <= BALANCE)
-        rows = (falls & ~_leans(poses, scene, acts, falls, backend)).nonzero()[:, 0]
     now = (poses[rows, :3, :3] @ target[rows][:, :, None])[:, :, 0]
     axis = torch.linalg.cross(now, up[rows])
     axis = torch.nn.functional.normalize(axis, dim=1) * tilt[rows, None]

@@ -253,6 +253,30 @@ def test_a_missing_file_is_one_clear_line_and_exit_code_2(dataset, capsys):
     assert "Traceback" not in message
 
 
+def test_a_calibration_corrects_the_depths_and_single_options_override_it(dataset, capsys):
+    """Without planes nothing but the estimates acts on what stands alone: all that is left is the factor."""
+    given = {"depth_factor": 0.9, "sigma_ray_fraction": 0.01, "sigma_lateral_mm": 2.0, "sigma_rotation_deg": 1.0}
+    (dataset / "c.json").write_text(json.dumps(given))
+    t = lambda path: np.array([list(map(float, r[5].split())) for r in fields(path)[1:]])  # noqa: E731
+    assert refine(dataset, "--calibration", dataset / "c.json", planes=False) == 0
+    np.testing.assert_allclose(t(dataset / "out.csv"), 0.9 * t(dataset / "est.csv"), atol=1e-3)
+    factor = ("--config.physics.depth-factor", "0.95")
+    assert refine(dataset, f"--calibration={dataset / 'c.json'}", *factor, planes=False) == 0
+    np.testing.assert_allclose(t(dataset / "out.csv"), 0.95 * t(dataset / "est.csv"), atol=1e-3)
+    (dataset / "c.json").write_text("{}")
+    assert refine(dataset, "--calibration", dataset / "c.json") == 2
+    assert "depth_factor" in capsys.readouterr().err
+    assert refine(dataset, "--calibration", dataset / "missing.json") == 2
+
+
+def test_calibrate_names_images_that_cannot_be_used_and_needs_planes(dataset, capsys):
+    args = ["calibrate", str(dataset / "est.csv"), "--dataset", str(dataset), "--out", str(dataset / "c.json")]
+    assert main(args) == 2
+    assert "--planes" in capsys.readouterr().err
+    assert main([*args, "--planes", str(dataset / "planes.json")]) == 2
+    assert "needs" in capsys.readouterr().err  # three estimates
+
+
 def test_the_paper_preset_sets_the_defaults_that_single_options_start_from():
     from physpose_torch.commands import parse
 

@@ -473,7 +473,7 @@ def test_images_at_rest_are_left_alone_and_report_fewer_steps(table, box, genera
     runs = []
     for call in (lambda f, *a, **k: f(*a, **k), general):
         sizes = []
-        refiner = PhysPoseRefiner(RefinerConfig(keep_trajectory=True, tolerance=5e-5))
+        refiner = PhysPoseRefiner(RefinerConfig(keep_trajectory=True, tolerance=5e-5, steps=60))
         result = call(refiner, poses, Scene.cat(scenes), callback=lambda step, p, t, sizes=sizes: sizes.append(len(p)))
         runs.append((result, sizes))
     (fused, sizes), (expected, sizes_) = runs

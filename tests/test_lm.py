@@ -13,6 +13,7 @@ from physpose_torch import (
     Plane,
     RefinerConfig,
     Scene,
+    Static,
     physics_report,
     se3,
 )
@@ -39,10 +40,22 @@ def standing(bodies, sink=0.0, spacing=0.2):
     return poses
 
 
+FAR_BELOW = Plane(UP, torch.tensor(-3.0, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("solver", ["lm", "descent"])
+def test_without_pose_cost_contacts_alone_act(solver):
+    scene, poses = Scene.tabletop([BOX, CAN], TABLE), standing([BOX, CAN], sink=0.02)
+    config = RefinerConfig(PhysicsConfig(pose_weight=0.0), solver=solver, steps=20, righting=0.0)
+    result = PhysPoseRefiner(config)(poses, scene)
+    assert bool(result.poses.isfinite().all())
+    assert float(result.report.penetration.max()) < 1e-3
+
+
 @pytest.mark.parametrize("sigma_common", [0.0, 0.03])
 def test_without_contacts_one_full_step_finds_the_minimum(sigma_common):
     """The pose cost is a quadratic, depth factor and all: from anywhere the step leads to the estimates."""
-    scene = Scene([BOX, CAN, BOX])
+    scene = Scene([BOX, CAN, BOX], [Static(FAR_BELOW)])
     measured = standing([BOX, CAN, BOX])
     physics = PhysicsConfig(robust=float("inf"), sigma_depth_common=sigma_common)
     config = RefinerConfig(physics, solver="lm", damping=1e-9, max_step=10.0)

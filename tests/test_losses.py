@@ -123,9 +123,10 @@ def test_a_depth_error_in_common_costs_what_the_joint_gaussian_says(box, can):
     measured = torch.stack([rotation(0, 0, 0), rotation(0.3, 0, 0)])
     measured[:, 2, 3] = torch.tensor([1.0, 0.5], dtype=torch.float64)
     T = se3.retract(measured, 0.02 * torch.randn(2, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64))
-    scene = Scene([box, can])
+    far_below = [Static(Plane(torch.tensor([0.0, -1.0, 0.0]), torch.tensor(-50.0)))]
+    scene = Scene([box, can], far_below)
     loss = PhysicsLoss(config)
-    alone = loss(T[:1], Scene([box]), measured=measured[:1]).pose
+    alone = loss(T[:1], Scene([box], far_below), measured=measured[:1]).pose
     along = float(T[0, 2, 3]) - 1.0
     across = (T[0, :2, 3] / 0.003).square().sum() + (se3.log_so3(T[0, :3, :3]) / 0.03).square().sum()
     assert alone.tolist() == pytest.approx([0.5 * (along**2 / (0.01**2 + 0.02**2) + float(across))])
@@ -141,6 +142,16 @@ def test_a_depth_error_in_common_costs_what_the_joint_gaussian_says(box, can):
     assert float(cost.detach()) == pytest.approx(float(expected.detach()))
     gradients = [torch.autograd.grad(x, xi, retain_graph=True)[0] for x in (expected, cost)]
     assert torch.allclose(*gradients, rtol=1e-6, atol=1e-6)
+
+
+def test_without_anything_static_depth_errors_have_nothing_in_common(box, can):
+    """Collisions alone would drive a scene away from the camera, where its rays are farther apart."""
+    measured = torch.stack([rotation(0, 0, 0), rotation(0.3, 0, 0)])
+    measured[:, 2, 3] = torch.tensor([1.0, 0.5], dtype=torch.float64)
+    T = measured.clone()
+    T[:, :3, 3] *= 1.01
+    costs = [PhysicsLoss(PhysicsConfig(sigma_depth_common=s))(T, Scene([box, can]), measured=measured) for s in (0, 0.1)]
+    torch.testing.assert_close(costs[0].pose, costs[1].pose)
 
 
 def test_a_given_covariance_is_taken_as_it_is(table, box):

@@ -46,7 +46,7 @@ def messy(table, box, can, angle):
 
 
 def test_a_consistent_scene_stays_where_it_is(table, box, can, angle):
-    """At rest, a stack, two boxes side by side: within 0.1 mm."""
+    """At rest, a stack, two boxes side by side: within 0.15 mm."""
     poses = table.poses(
         (0, 0, 0.02, (0, 0, 0.4)),
         (0.15, 0, 0.04),
@@ -56,7 +56,7 @@ def test_a_consistent_scene_stays_where_it_is(table, box, can, angle):
         (-0.0999, -0.1, 0.02),
     )
     result = PhysPoseRefiner()(poses, Scene.tabletop([box, can, box, angle, box, box], table.plane))
-    assert float(motion(result.poses, poses).max()) < 1e-4
+    assert float(motion(result.poses, poses).max()) < 1.5e-4
     assert float((result.poses - poses)[:, :3, :3].abs().max()) < 2e-3
 
 
