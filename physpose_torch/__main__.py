@@ -1,6 +1,7 @@
 """The ``physpose`` command."""
 
 import logging
+import os
 import sys
 from collections.abc import Sequence
 
@@ -19,6 +20,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except PhysPoseError as error:
         print(f"physpose: error: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError:  # the reader, head say, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except KeyboardInterrupt:
         print("physpose: interrupted", file=sys.stderr)
         return 130

@@ -34,6 +34,8 @@ FACTORS = (0.7, 1.4)
 """Depth factors between which the fit looks."""
 LATERAL_GUESS = 0.003
 """[m]; from one direction of view, errors along and across the ray look alike: a weak guess, by a factor of e, decides then."""
+STARTS = 4
+"""Best depth factors of a grid, from each of which a fit is tried."""
 CONTACT = 0.0005
 """[m]; scans and tables are not flatter than this."""
 NODES = 41
@@ -119,6 +121,9 @@ def observe(poses: Tensor, scene: Scene, *, scores: Tensor | None = None) -> Obs
     rise = level - offset - height
     reach = (normal * poses[who, :3, 3]).sum(1)
     told = (tilt < WIDEST_TILT) & (clear > LEAST_APART) & (rise.abs() < WIDEST_HEIGHT)
+    # of several planes an object is above, it is the nearest one's
+    nearest = rise.new_full((len(scene),), torch.inf).scatter_reduce(0, who[told], rise[told].abs(), "amin")
+    told &= rise.abs() <= nearest[who]
     columns = (scene.image[who], rise, reach, -level / distance, distance, tilt, variance)
     return Observations(*(x[told] for x in columns), scene.n_images)
 
@@ -146,9 +151,18 @@ def calibrate(
         on_resample: called after each.
 
     Raises:
-        InvalidInputError: fewer than 10 objects that may stand on a plane.
+        InvalidInputError: fewer than 10 objects that may stand on a plane, or ``cluster`` has another length.
     """
-    o = observations
+    with torch.inference_mode(False), torch.enable_grad():
+        o = Observations(*(x.clone() if isinstance(x, Tensor) else x for x in observations))
+        return _calibrate(o, cluster, resamples, seed, on_resample)
+
+
+def _calibrate(
+    o: Observations, cluster: Tensor | None, resamples: int, seed: int, on_resample: Callable[[], None]
+) -> Calibration:
+    if cluster is not None and cluster.shape != (o.images,):
+        raise InvalidInputError(f"cluster has shape {tuple(cluster.shape)}, expected ({o.images},), one number an image")
     if len(o.rise) < LEAST_OBSERVATIONS:
         raise InvalidInputError(
             f"only {len(o.rise)} of the estimates, in {o.images} images, may stand upright on a plane; a calibration needs "
@@ -158,7 +172,10 @@ def calibrate(
     # several maxima: standing objects may be taken for stacked ones
     guesses = np.linspace(*np.log(FACTORS), 141)
     starts = [np.array([guess, *np.log([0.01, 0.005, LATERAL_GUESS, 0.04]), -1.0, -2.0]) for guess in guesses]
-    best = _fit(min(starts, key=lambda x: float(_surprise(torch.from_numpy(x), o, weight))), o, weight)
+    starts.sort(key=lambda x: float(_surprise(torch.from_numpy(x), o, weight)))
+    # a fit may leap away from where it starts
+    fits = [starts[0], *(_fit(x, o, weight) for x in starts[:STARTS])]
+    best = min(fits, key=lambda x: float(_surprise(torch.from_numpy(x), o, weight)))
     standing, scatter = 1 / (1 + np.exp(best[5:]).sum()), math.exp(best[1])
     if standing < LEAST_STANDING or scatter > WIDEST_SCATTER:
         logger.warning(

@@ -15,10 +15,18 @@ STILL_STEPS = 10
 
 def _check_positive(config: object, *names: str) -> None:
     for name in names:
-        if not getattr(config, name) > 0:
+        if not 0 < getattr(config, name) < math.inf:
             raise InvalidInputError(
                 f"{type(config).__name__}.{name} = {getattr(config, name)}, expected a positive number"
             )
+
+
+def _check_factor(config: object) -> None:
+    if not 0.5 <= config.depth_factor <= 2.0:
+        raise InvalidInputError(
+            f"{type(config).__name__}.depth_factor = {config.depth_factor}, expected a number from 0.5 to 2; units belong "
+            "into the poses"
+        )
 
 
 @dataclass(frozen=True)
@@ -63,8 +71,9 @@ class Calibration:
     """95 % confidence interval of each of these numbers, by name."""
 
     def __post_init__(self) -> None:
-        _check_positive(self, "depth_factor", "sigma_ray_fraction", "sigma_lateral", "sigma_rotation")
-        if not self.sigma_depth_common >= 0:
+        _check_factor(self)
+        _check_positive(self, "sigma_ray_fraction", "sigma_lateral", "sigma_rotation")
+        if not 0 <= self.sigma_depth_common < math.inf:
             raise InvalidInputError(f"Calibration.sigma_depth_common = {self.sigma_depth_common}, expected >= 0")
 
 
@@ -110,7 +119,10 @@ class PhysicsConfig:
     """Distance backend: ``auto``, or a name in ``physpose_torch.distance.backends()``."""
 
     def __post_init__(self) -> None:
-        _check_positive(self, "depth_factor", "sigma_lateral", "sigma_rotation", "gravity_reach", "robust")
+        _check_positive(self, "sigma_lateral", "sigma_rotation", "gravity_reach")
+        _check_factor(self)
+        if not self.robust > 0:
+            raise InvalidInputError(f"PhysicsConfig.robust = {self.robust}, expected a positive number or infinity")
         for name in (
             "sigma_ray",
             "sigma_ray_fraction",

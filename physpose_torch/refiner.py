@@ -37,7 +37,7 @@ class Refinement:
     """(steps + 1, ..., N, 4, 4) if the config keeps it, from the estimates on; removing the depth bias and the slide out of
     planes are in the first step."""
     steps: Tensor
-    """(..., I) steps that each image took."""
+    """(..., I) steps that each image took, both times if it was refined once more with objects righted."""
     converged: Tensor
     """(..., I) bool: the image came to rest before the step limit."""
     image: Tensor
@@ -120,7 +120,7 @@ class PhysPoseRefiner(nn.Module):
             backend = self.config.physics.backend
             report = report_of(result.poses.reshape(measured.shape), scene, many, acts, backend, result.cost)
             righted = torch.zeros(len(many), dtype=torch.bool, device=measured.device)
-            if self.config.righting > 0:
+            if self.config.righting > 0 and self.config.steps > 0 and self.config.physics.gravity_weight > 0:
                 planes = len(scene) + len(scene.static_bodies)
                 result, righted = right_fallen(
                     result,
@@ -129,6 +129,7 @@ class PhysPoseRefiner(nn.Module):
                     many,
                     acts,
                     solve,
+                    pose_weight=self.config.physics.pose_weight,
                     first_plane=planes,
                     limit=self.config.righting,
                     backend=backend,

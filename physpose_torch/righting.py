@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from physpose_torch import se3
-from physpose_torch.contacts import SUPPORT_SLOPE
+from physpose_torch.contacts import SUPPORT_SLOPE, plane_variance
 from physpose_torch.distance.autograd import signed_distance
 from physpose_torch.distance.broadphase import instance_bounds, meeting_pairs
 from physpose_torch.geometry.resting import resting_poses
-from physpose_torch.losses import PhysicsTerms
+from physpose_torch.losses import PhysicsTerms, prior_loss
 from physpose_torch.prior import PosePrior
 from physpose_torch.report import PhysicsReport, report_of
 from physpose_torch.scene import Scene
@@ -28,7 +28,14 @@ TOLERANCE = 8e-3
 TILT = math.radians(7.0)
 """… if a tilt by so much brings it into play: poses that have come to rest in the refinement are a few degrees askew."""
 DEEPER = 3e-3
-"""[m]; an object that by being righted runs into something by more than this is not righted."""
+"""[m]; an object that by being righted runs into something by more than this is not righted, and …"""
+HIGHER = 0.015
+"""… [m]; nor is one that ends higher above its support by more than this."""
+DROP = 0.01
+"""[m]; what is left to gravity of a righted object's way down, and three σ of the plane: its estimated depth is kept as far
+as that goes."""
+LEAST_SLOPE = 0.2
+"""Sine of the least angle between viewing ray and level at which an object is brought down along its ray."""
 NEAR = 0.02
 """[m]; an object higher above its support than this is held by something unseen."""
 
@@ -84,6 +91,8 @@ def find_fallen(
     rows = doubtful.nonzero()[:, 0]
     now = (poses[rows, :3, :3] @ target[rows][:, :, None])[:, :, 0]
     axis = torch.linalg.cross(now, up[rows])
+    level = torch.linalg.cross(up[rows], now.roll(1, 1) + 0.5)  # upside down, any level axis will do
+    axis = torch.where(axis.norm(dim=1, keepdim=True) > 1e-9, axis, level)
     axis = torch.nn.functional.normalize(axis, dim=1) * tilt[rows, None]
     return Righting(rows, se3.exp_so3(axis))
 
@@ -112,6 +121,12 @@ def _leans(poses: Tensor, scene: Scene, acts: Tensor, falls: Tensor, backend: st
     beside = ((found.normal * down[who]).sum(-1).abs() < SUPPORT_SLOPE) & (found.distance <= TOLERANCE)
     above = ((found.point_a - mass[who]) * down[who]).sum(-1) < 0
     leans[who[beside & above]] = True
+    normal, offset = scene.plane_normal.to(poses), scene.plane_offset.to(poses)
+    for i, plane in scene.plane_pairs.tolist():
+        if bool(falls[i]) and abs(float(normal[plane] @ down[i])) < SUPPORT_SLOPE:
+            corners = se3.apply(poses[i], scene.objects[i].parts.vertices.to(poses))
+            beside = corners @ normal[plane] - offset[plane] <= TOLERANCE
+            leans[i] |= bool((beside & ((corners - mass[i]) @ down[i] < 0)).any())
     return leans
 
 
@@ -123,13 +138,14 @@ def right_fallen(
     acts: Tensor,
     solve: Callable[[PosePrior, Scene, Tensor], Descent],
     *,
+    pose_weight: float,
     first_plane: int,
     limit: float,
     backend: str,
 ) -> tuple[Descent, Tensor]:
     """Refine the images in which objects would fall over once more, from estimates that stand.
 
-    Where a righted object then runs deeper into something than it did, its image stays as it was.
+    Where a righted object then runs deeper into something than it did, or hangs higher, its image stays as it was.
 
     Args:
         result: of the flat scene's first refinement.
@@ -138,6 +154,7 @@ def right_fallen(
         scene: the flat scene.
         acts: (N,) bool.
         solve: the solver.
+        pose_weight: of the cost; what a turn costs by the estimates as they were shows in the result's terms.
         first_plane: the least number in the report's ``support`` that means a plane.
         limit: largest turn [rad].
         backend: distance backend.
@@ -157,23 +174,51 @@ def right_fallen(
     images = scene.image[fallen.cpu()].unique()
     part, rows = scene.select(images)
     at = rows.to(righted.device)
-    upright = _turned(prior.measured, result.poses, scene, fallen, turn)
-    columns = (x[rows.to(x.device)] for x in (upright, *prior[1:4]))
-    again = solve(PosePrior(*columns, part.image.to(at.device), part.n_images, *prior[6:]), part, acts[rows])
-    deeper = report_of(again.poses, part, part, acts[rows], backend, again.cost).penetration - depth[at]
-    bad = part.image.to(at.device)[(deeper > DEEPER) & righted[at]].unique().cpu()
+    upright = _turned(prior.measured, result.poses, scene, acts, fallen, turn)
+    columns = [x[rows.to(x.device)] for x in prior[1:4]]
+    own = PosePrior(prior.measured[at], *columns, part.image.to(at.device), part.n_images, *prior[6:])
+    again = solve(own._replace(measured=upright[at]), part, acts[rows])
+    pose = prior_loss(again.poses, own)
+    total = again.terms.total + pose_weight * (pose - again.terms.pose)
+    again = again._replace(terms=again.terms._replace(pose=pose, total=total))
+    after = report_of(again.poses, part, part, acts[rows], backend, again.cost)
+    refused = (after.penetration - depth[at] > DEEPER) | ~(after.gap - gap[at] <= HIGHER)
+    bad = part.image.to(at.device)[refused & righted[at]].unique().cpu()
     good = torch.ones(part.n_images, dtype=torch.bool).index_fill(0, bad, False)
     keep = good[part.image].to(at.device)
     righted[at[~keep]] = False
     return _merged(result, again, images, good, at, keep), righted
 
 
-def _turned(measured: Tensor, poses: Tensor, scene: Scene, rows: Tensor, turn: Tensor) -> Tensor:
-    """Estimates (N, 4, 4), those of ``rows`` with the refined orientation turned, about the centres of their bounds."""
+def _turned(measured: Tensor, poses: Tensor, scene: Scene, acts: Tensor, rows: Tensor, turn: Tensor) -> Tensor:
+    """Estimates (N, 4, 4), those of ``rows`` with the refined orientation turned, about the centres of their bounds.
+
+    Those that would hang in the air are moved along their viewing rays until gravity can do the rest.
+    """
     center = scene.object_center.to(poses)[rows, :, None]
     upright = measured[rows].clone()
     middle = upright[:, :3, :3] @ center + upright[:, :3, 3:]
     upright[:, :3, :3] = turn @ poses[rows, :3, :3]
+    down = scene.gravity.to(poses)[scene.image[rows.cpu()].to(poses.device)]
+    reach = []
+    for T in (poses[rows], upright):  # how far the objects reach down from their centres
+        bodies = [scene.objects[i] for i in rows.tolist()]
+        reach.append(
+            torch.stack(
+                [
+                    ((body.parts.vertices.to(T) - c[:, 0]) @ (R.mT @ g)).amax()
+                    for body, c, R, g in zip(bodies, center, T[:, :3, :3], down, strict=True)
+                ]
+            )
+        )
+    ray = torch.nn.functional.normalize(middle[:, :, 0], dim=1)
+    slope = (ray * down).sum(1, keepdim=True)
+    along = torch.where(slope > LEAST_SLOPE, ray / slope.clamp_min(LEAST_SLOPE), down)
+    who, plane = scene.plane_pairs.to(poses.device).unbind(1)
+    sigma = plane_variance(poses, scene, who, plane, acts).sqrt()
+    sigma = poses.new_zeros(len(poses)).scatter_reduce(0, who, sigma, "amax")[rows]
+    fall = (reach[0] - reach[1] - DROP - 3 * sigma).clamp_min(0.0)
+    middle = middle + (fall[:, None] * along)[:, :, None]
     upright[:, :3, 3:] = middle - upright[:, :3, :3] @ center
     return measured.index_copy(0, rows, upright)
 

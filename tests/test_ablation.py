@@ -112,7 +112,7 @@ def test_each_row_changes_what_its_name_says_and_nothing_else():
 
 def test_what_lm_does_not_know_is_left_to_the_descent_and_says_so():
     rows = {row.name: row for row in list_variants(RefinerConfig.lm())}
-    for name in ("gravity paper", "smoothing gumbel", "without P"):
+    for name in ("gravity paper", "smoothing gumbel"):
         assert rows[name].config.solver == "descent"
         assert rows[name].shown == f"{name}, descent"
     assert rows["without C"].config.solver == "lm"

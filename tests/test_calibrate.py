@@ -281,3 +281,46 @@ def hulls(tmp_path, ycbv):
         for path in sorted((ycbv / "models").glob("*.ply")):
             trimesh.load_mesh(path).convex_hull.export(folder / path.name)
     return folder
+
+
+# ---- what a review found
+
+
+def test_a_fit_does_not_leap_out_of_its_basin(table):
+    """Few images from one viewpoint, a floor below the table, hardly any tilt: the likelihood is steep and has many maxima."""
+    g = torch.Generator().manual_seed(0)
+    floor = Plane(table.plane.normal, table.plane.offset - 0.15)
+    scenes, poses = [], []
+    for _ in range(12):
+        spots = 0.4 * (torch.rand(6, 2, generator=g, dtype=torch.float64) - 0.5)
+        turns = 0.01 * torch.randn(6, 3, generator=g, dtype=torch.float64)
+        rows = [table.at(x, y, 0.025, turn) for (x, y), turn in zip(spots.tolist(), turns, strict=True)]
+        poses.append(perturb_like_estimator(torch.stack(rows), generator=g, depth_bias=0.0, rotation_sigma_deg=0.0))
+        scenes.append(Scene([BODIES[1]] * 6, [Static(table.plane), Static(floor)], gravity=table.gravity))
+    seen = observe(torch.cat(poses), Scene.cat(scenes))
+    assert len(seen.rise) == 72  # each with its nearest plane
+    assert calibrate(seen, resamples=0).depth_factor == pytest.approx(1.0, abs=0.01)
+
+
+def test_calibrating_works_in_inference_mode_and_checks_its_clusters():
+    poses, scene = estimated(images(12), **TRUE)
+    seen = observe(poses, scene)
+    with torch.inference_mode():
+        inside = calibrate(observe(poses, scene), resamples=2)
+    assert inside == calibrate(seen, resamples=2)
+    with pytest.raises(InvalidInputError, match="cluster"):
+        calibrate(seen, cluster=torch.zeros(11, dtype=torch.long))
+
+
+@pytest.mark.parametrize("factor", [0.0, 0.4, 2.5, float("inf"), float("nan")])
+def test_a_depth_factor_that_is_a_unit_is_refused(factor):
+    for make in (lambda: Calibration(factor, 0.01, 0.002, 0.03), lambda: PhysicsConfig(depth_factor=factor)):
+        with pytest.raises(InvalidInputError, match="depth_factor"):
+            make()
+
+
+@pytest.mark.parametrize("out", ["missing/c.json", "."])
+def test_where_nothing_can_be_written_nothing_is_begun(tmp_path, out, capsys):
+    args = ["calibrate", "e.csv", "--dataset", "d", "--planes", "p.json", "--out", str(tmp_path / out)]
+    assert main(args) == 2
+    assert "name a file to write" in capsys.readouterr().err

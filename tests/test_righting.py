@@ -7,9 +7,11 @@ import pytest
 import torch
 import trimesh
 
-from physpose_torch.config import RefinerConfig
-from physpose_torch.geometry.body import Body
+from physpose_torch.config import PhysicsConfig, RefinerConfig
+from physpose_torch.geometry.body import Body, Plane
+from physpose_torch.geometry.convex import ConvexParts
 from physpose_torch.geometry.resting import resting_poses
+from physpose_torch.losses import PhysicsLoss
 from physpose_torch.refiner import PhysPoseRefiner
 from physpose_torch.scene import Scene, Static
 
@@ -179,3 +181,65 @@ def test_the_callers_dtype_comes_back(table, slab):
     result = PhysPoseRefiner()(T, Scene.tabletop([slab], table.plane))
     assert result.righted.tolist() == [True]
     assert result.poses.dtype == torch.float32
+
+
+@pytest.mark.parametrize("config", SOLVERS, ids=["descent", "lm"])
+@pytest.mark.parametrize("extents", [(0.3, 0.3, 0.02), (0.2, 0.25, 0.05), (0.12, 0.12, 0.03)])
+@pytest.mark.parametrize("lift", [0.0, 0.015])
+def test_what_is_righted_comes_to_rest_and_does_not_hang_in_the_air(table, config, extents, lift):
+    """A large board's centre is far higher on its edge than lying."""
+    T = balanced_on_an_edge(table, math.radians(40), extents)
+    T[:3, 3] += lift * table.up
+    board = Body.box(extents, label="board")
+    result = PhysPoseRefiner(config)(T[None], Scene.tabletop([board], table.plane))
+    assert result.righted.all()
+    assert float(result.report.gap.max()) < 5e-3
+    assert math.degrees(up_of(table, result.poses[0])) < 2
+
+
+def test_turning_costs_what_the_estimate_says(table, slab):
+    """So of two hypotheses the one that needed no turning is the better."""
+    good = table.at(0, 0, 0.015)
+    good[:3, 3] *= 1.02
+    hypotheses = torch.stack([good, balanced_on_an_edge(table, math.radians(35))])[:, None]
+    scene = Scene.tabletop([slab], table.plane)
+    result = PhysPoseRefiner()(hypotheses, scene)
+    assert result.righted.tolist() == [[False], [True]]
+    expected = PhysicsLoss()(result.poses, scene, measured=hypotheses)
+    torch.testing.assert_close(result.terms.pose, expected.pose)
+    torch.testing.assert_close(result.terms.total, expected.total)
+    torch.testing.assert_close(result.best(), result.poses[0])
+
+
+def test_what_leans_on_a_vertical_plane_stays(table, slab):
+    tilt = math.radians(60)
+    T = balanced_on_an_edge(table, tilt)
+    x = table.T[:3, 0]
+    reach = 0.06 * math.cos(tilt) + 0.015 * math.sin(tilt)
+    wall = Plane(x, x @ T[:3, 3] - reach)
+    held = Scene([slab], [Static(table.plane), Static(wall)], gravity=table.gravity)
+    assert not PhysPoseRefiner()(T[None], held).righted.any()
+
+
+@pytest.mark.parametrize("change", [{"steps": 0}, {"physics": PhysicsConfig(gravity_weight=0.0)}])
+def test_without_gravity_in_the_cost_or_without_steps_nothing_is_righted(table, slab, change):
+    T = balanced_on_an_edge(table, 0.7)[None]
+    assert not PhysPoseRefiner(RefinerConfig(**change))(T, Scene.tabletop([slab], table.plane)).righted.any()
+
+
+def test_a_mesh_without_volume_stands_nowhere(table, box):
+    sheet = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0]], [[0, 1, 2]], process=False)
+    body = Body("sheet", box.parts, sheet)
+    assert len(resting_poses(body).up) == 0
+    assert not PhysPoseRefiner()(balanced_on_an_edge(table, 0.7)[None], Scene.tabletop([body], table.plane)).righted.any()
+
+
+def test_upside_down_is_turned_too_where_nothing_nearer_is_stable(table):
+    """A cone on its tip, and a limit of half a turn."""
+    mesh = trimesh.creation.cone(radius=0.05, height=0.08, sections=24)
+    mesh.apply_translation(-mesh.bounds.mean(0))
+    cone = Body("cone", ConvexParts.from_hulls([np.array(mesh.vertices)]), mesh)
+    T = table.poses((0, 0, 0.04, (math.pi, 0, 0)))
+    result = PhysPoseRefiner(RefinerConfig(righting=math.pi))(T, Scene.tabletop([cone], table.plane))
+    assert result.righted.all()
+    assert math.degrees(up_of(table, result.poses[0])) < 3

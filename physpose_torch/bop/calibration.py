@@ -64,6 +64,6 @@ def read_calibration(path: str | os.PathLike) -> Calibration:
 
 
 def _number(value: Any, path: str | os.PathLike, name: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:
         raise DataError(f"{path}: {name} is {value!r}, expected a finite number; make it with physpose calibrate")
     return float(value)

@@ -25,7 +25,7 @@ from physpose_torch.bop.ablation import (
 from physpose_torch.bop.dataset import BopDataset
 from physpose_torch.bop.formats import Estimates
 from physpose_torch.bop.scenes import ImageScene
-from physpose_torch.commands.common import progress
+from physpose_torch.commands.common import check_output, progress
 from physpose_torch.commands.images import ImageOptions, in_batches
 from physpose_torch.config import Calibration, RefinerConfig
 from physpose_torch.errors import InvalidInputError, PhysPoseError
@@ -73,6 +73,7 @@ class Ablate(ImageOptions):
     """No progress bar and no table."""
 
     def __call__(self) -> int:
+        check_output(self.json)
         variants = self._variants()
         estimates, dataset, total, todo = self.open()
         images: list[ImageScene] = []
@@ -84,6 +85,8 @@ class Ablate(ImageOptions):
                 images += some
                 bar.update(len(some))
         looked_at = {(i.scene_id, i.im_id) for i in images}
+        if not looked_at:
+            raise InvalidInputError(f"{self.estimates}: no images to compare; check --scenes, or the file")
         ablation = Ablation(estimates, restricted(dataset, looked_at), batches)
         count = sum(len(b.images) for b in batches)
         with progress(count * (len(variants) + 1), "ablate", "image", quiet=self.quiet) as bar:

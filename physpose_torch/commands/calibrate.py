@@ -1,5 +1,6 @@
 """``physpose calibrate``: an estimator's depth bias and spread, from its estimates on known tables and no labels."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,13 +10,15 @@ import torch
 from physpose_torch.bop.calibration import write_calibration
 from physpose_torch.bop.scenes import ImageScene, poses_of
 from physpose_torch.calibrate import Observations, calibrate, observe
-from physpose_torch.commands.common import progress, table
+from physpose_torch.commands.common import check_output, progress, table
 from physpose_torch.commands.images import ImageOptions, in_batches
 from physpose_torch.config import Calibration
 from physpose_torch.errors import InvalidInputError
 from physpose_torch.scene import Scene
 
 __all__ = ["Calibrate"]
+
+logger = logging.getLogger("physpose_torch")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,23 +30,28 @@ class Calibrate(ImageOptions):
     many arrangements, from different heights: from one direction, errors along and across the ray look alike.
     """
 
+    planes: Path | None = None
+    """Table planes, which are needed: {scene: {image: {"normal": [3], "offset_mm": x}}} or {"R": 3x3, "t": [m]}."""
     plane_sigma_mm: float = 0.0
     """Standard deviation of the height of planes whose entry states none. 0: what planes are off by is put down to the
     estimator, and a refinement with such planes can count on it."""
     out: Path
     """Calibration to write, JSON; physpose refine --calibration takes it."""
     resamples: int = 50
-    """Of the bootstrap; 0: no intervals."""
+    """How often the images are drawn anew, for the intervals; 0: no intervals."""
     seed: int = 0
-    """Of the bootstrap."""
+    """Of these draws."""
     quiet: bool = False
     """No progress bar and no table."""
 
     def __call__(self) -> int:
         if self.planes is None:
             raise InvalidInputError("physpose calibrate needs the table: give --planes P.json")
-        if self.resamples < 0 or self.resamples == 1:
-            raise InvalidInputError(f"--resamples {self.resamples}: expected 0, or 2 or more")
+        if self.resamples < 0 or self.resamples == 1 or self.seed < 0:
+            raise InvalidInputError(
+                f"--resamples {self.resamples}, --seed {self.seed}: expected 0, or 2 or more resamples, and a seed >= 0"
+            )
+        check_output(self.out)
         opened = self.open()
         observations, clusters, problems = [], [], []
         with progress(opened.count, "look", "image", quiet=self.quiet) as bar:
@@ -54,6 +62,8 @@ class Calibrate(ImageOptions):
                     clusters += [image.scene_id for image in ready]
                 problems += [problem for image in batch for problem in image.problems]
                 bar.update(len(batch))
+        for problem in problems:
+            logger.error(problem)
         seen = Observations.cat(observations)
         with progress(self.resamples, "resample", "fit", quiet=self.quiet) as bar:
             calibration = calibrate(
@@ -68,8 +78,6 @@ class Calibrate(ImageOptions):
             print(f"{len(seen.rise)} estimates in {seen.images} images may stand upright on their plane\n")
             print(_describe(calibration))
             print(f"\nwritten: {self.out}")
-        for problem in problems:
-            print(f"error: {problem}")
         return 1 if problems else 0
 
     def _observe(self, images: Sequence[ImageScene], estimates) -> Observations:

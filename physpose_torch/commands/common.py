@@ -1,11 +1,26 @@
 """What the commands share: progress bars and the tables they print."""
 
 import sys
+from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
-__all__ = ["describe", "progress", "table"]
+from physpose_torch.errors import DataError
+
+__all__ = ["check_output", "describe", "progress", "table"]
+
+
+def check_output(*paths: Path | None) -> None:
+    """Refuse to start long work whose results could not be written.
+
+    Raises:
+        DataError: a file's folder does not exist, or the path is a folder.
+    """
+    for path in paths:
+        if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
+            what = "is a folder" if path.is_dir() else "lies in no existing folder"
+            raise DataError(f"{path} {what}; name a file to write")
 
 
 def progress(total: int, what: str, unit: str, *, quiet: bool = False) -> tqdm:

@@ -15,7 +15,7 @@ from physpose_torch.bop.formats import Estimates, PlaneRecord, read_estimates, r
 from physpose_torch.bop.metrics import Recall, Scores, evaluate
 from physpose_torch.bop.residuals import Distribution, distribution, errors_against_gt
 from physpose_torch.bop.vsd import VsdDepth
-from physpose_torch.commands.common import progress, table
+from physpose_torch.commands.common import check_output, progress, table
 
 __all__ = ["Eval"]
 
@@ -56,6 +56,7 @@ class Eval:
     """Print nothing."""
 
     def __call__(self) -> int:
+        check_output(self.json)
         estimates = read_estimates(self.estimates)
         dataset = BopDataset(self.dataset, split=self.split, targets=self.targets)
         planes, bad_planes = read_planes(self.planes) if self.planes is not None else ({}, [])

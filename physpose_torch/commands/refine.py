@@ -12,7 +12,7 @@ import torch
 
 from physpose_torch.bop.formats import Estimates, write_estimates
 from physpose_torch.bop.scenes import ImageScene, poses_of
-from physpose_torch.commands.common import describe, progress
+from physpose_torch.commands.common import check_output, describe, progress
 from physpose_torch.commands.images import ImageOptions, in_batches
 from physpose_torch.config import RefinerConfig
 from physpose_torch.errors import PhysPoseError
@@ -48,6 +48,7 @@ class Refine(ImageOptions):
     """No progress bar and no summary."""
 
     def __call__(self) -> int:
+        check_output(self.json, self.out)
         estimates, _, total, todo = self.open()
         refiner = PhysPoseRefiner(self.config)
         poses = estimates.T_camera_object.clone()

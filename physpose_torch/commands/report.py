@@ -11,7 +11,7 @@ import numpy as np
 
 from physpose_torch.bop.formats import Estimates
 from physpose_torch.bop.scenes import ImageScene, poses_of
-from physpose_torch.commands.common import progress
+from physpose_torch.commands.common import check_output, progress
 from physpose_torch.commands.images import ImageOptions, in_batches
 from physpose_torch.errors import PhysPoseError
 from physpose_torch.losses import acting
@@ -48,6 +48,7 @@ class Report(ImageOptions):
     """No progress bar and no table."""
 
     def __call__(self) -> int:
+        check_output(self.json)
         estimates, _, total, todo = self.open()
         rows: list[Row] = []
         problems: list[str] = []

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import trimesh
+from scipy.spatial import QhullError
 from torch import Tensor
 
 from physpose_torch.geometry.body import Body
@@ -34,14 +35,18 @@ class RestingPoses(NamedTuple):
     """(S,) angle to the nearest other one [rad]; π if there is none."""
 
 
-@lru_cache(maxsize=4096)
+@lru_cache(maxsize=256)
 def resting_poses(body: Body) -> RestingPoses:
     """Faces of the convex hull of a body's mesh on which it stands with a base to speak of; none for a ball.
 
     The centre of mass over a face is where the body comes to rest; faces that it would leave at a touch (the side of a can,
     the edge of a plate) do not count.
     """
-    hull = trimesh.Trimesh(body.mesh.vertices, body.mesh.faces, process=False).convex_hull
+    try:
+        hull = trimesh.Trimesh(body.mesh.vertices, body.mesh.faces, process=False).convex_hull
+    except QhullError:  # flat, or a line
+        none = torch.zeros(0, dtype=torch.float64)
+        return RestingPoses(none.reshape(0, 3), none, none)
     corners = np.asarray(hull.vertices)
     center, radius = body.center_of_mass.numpy(), body.radius
     triangles, normals = np.asarray(hull.triangles), np.asarray(hull.face_normals)
