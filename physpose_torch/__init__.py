@@ -14,7 +14,7 @@ _HOMES = {
         "PhysPoseError",
         "UnknownLabelError",
     ],
-    "config": ["PhysicsConfig", "RefinerConfig", "Smoothing"],
+    "config": ["Calibration", "PhysicsConfig", "RefinerConfig", "Smoothing"],
     "geometry.convex": ["ConvexParts"],
     "geometry.decompose": ["DecomposeOptions"],
     "geometry.body": ["Body", "Plane"],
