@@ -95,7 +95,7 @@ def slide_onto_planes(poses: Tensor, scene: Scene) -> Tensor:
     of the body's bounds. Of several planes the one that is reached first counts.
     """
     poses = poses.clone()
-    ray = (poses[:, :3, :3] @ scene.object_center.to(poses)[:, :, None])[:, :, 0] + poses[:, :3, 3]
+    ray = scene.centers(poses)
     distance = torch.linalg.vector_norm(ray, dim=-1)
     who, plane = scene.plane_pairs.to(poses.device).unbind(1)
     slope = (scene.plane_normal.to(poses)[plane] * ray[who]).sum(-1) / distance[who]
@@ -144,7 +144,7 @@ def disturb(
         generator: of the draws.
         scores: (N,), see :class:`~physpose_torch.losses.PhysicsLoss`; only objects that act count for the centre.
     """
-    centers = (poses[:, :3, :3] @ scene.object_center.to(poses)[:, :, None])[:, :, 0] + poses[:, :3, 3]
+    centers = scene.centers(poses)
     middle = centers[acting(scene, scores)].mean(0) if len(scene) else poses.new_zeros(3)
     added = torch.diag(torch.tensor([tilt**2, tilt**2, offset**2], dtype=torch.float64))
     planes = []

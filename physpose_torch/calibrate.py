@@ -18,7 +18,7 @@ from torch import Tensor
 from physpose_torch.config import Calibration
 from physpose_torch.contacts import SUPPORT_SLOPE, plane_variance
 from physpose_torch.errors import InvalidInputError
-from physpose_torch.geometry.resting import resting_poses
+from physpose_torch.geometry.resting import nearest_rest
 from physpose_torch.losses import acting, check_poses
 from physpose_torch.scene import Scene
 
@@ -105,22 +105,14 @@ def observe(poses: Tensor, scene: Scene, *, scores: Tensor | None = None) -> Obs
     keep = acts[who] & level
     who, plane, normal, offset = who[keep], plane[keep], normal[keep], offset[keep]
     variance = plane_variance(poses, scene, who, plane, acts)
-    tilt, height, clear = (x.new_full((len(who),), torch.inf) for x in (offset, offset, offset))
     up = (poses[who, :3, :3].mT @ normal[:, :, None])[:, :, 0]
-    bodies = [scene.objects[i] for i in who.tolist()]
-    for body in dict.fromkeys(bodies):
-        rest = resting_poses(body)
-        rows = torch.tensor([b is body for b in bodies]).nonzero()[:, 0]
-        if len(rest.up):
-            cosine, best = (up[rows] @ rest.up.mT).max(1)
-            tilt[rows] = torch.arccos(cosine.clamp(-1.0, 1.0))
-            height[rows], clear[rows] = rest.height[best], rest.apart[best]
-    center = (poses[who, :3, :3] @ scene.object_center[who][:, :, None])[:, :, 0] + poses[who, :3, 3]
+    tilt, _, height, apart = nearest_rest([scene.objects[i] for i in who.tolist()], up)
+    center = scene.centers(poses)[who]
     level = (normal * center).sum(1)
     distance = torch.linalg.vector_norm(center, dim=1)
     rise = level - offset - height
     reach = (normal * poses[who, :3, 3]).sum(1)
-    told = (tilt < WIDEST_TILT) & (clear > LEAST_APART) & (rise.abs() < WIDEST_HEIGHT)
+    told = (tilt < WIDEST_TILT) & (apart > LEAST_APART) & (rise.abs() < WIDEST_HEIGHT)
     # of several planes an object is above, it is the nearest one's
     nearest = rise.new_full((len(scene),), torch.inf).scatter_reduce(0, who[told], rise[told].abs(), "amin")
     told &= rise.abs() <= nearest[who]
@@ -139,9 +131,9 @@ def calibrate(
     """The estimator's depth factor and spread that explain the observations best (maximum likelihood).
 
     Each object stands as estimated, off by normal errors of the depth factor (its own and its image's), of the place across
-    the ray, of rotation and of the plane; or it stands on something else, at any height; or it is leaning or wrong altogether,
-    at any height and tilt. From one direction
-    of view, errors along and across the ray look alike; there a weak guess decides (3 mm across, give or take a factor of e).
+    the ray, of rotation and of the plane; or it stands on something else, at any height; or it is leaning or wrong
+    altogether, at any height and tilt. From one direction of view, errors along and across the ray look alike; there a weak
+    guess decides (3 mm across, give or take a factor of e).
 
     Args:
         observations: of many images, see :func:`observe`.

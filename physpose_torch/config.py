@@ -55,7 +55,8 @@ class Smoothing:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What an estimator's errors are like, see :func:`physpose_torch.calibrate`; for :meth:`RefinerConfig.calibrated`."""
+    """What an estimator's errors are like, by :func:`physpose_torch.calibrate.calibrate`; see also
+    :meth:`RefinerConfig.calibrated`."""
 
     depth_factor: float
     """What estimated translations must be multiplied by."""

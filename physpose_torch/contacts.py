@@ -272,7 +272,7 @@ def plane_variance(poses: Tensor, scene: Scene, who: Tensor, plane: Tensor, acts
     if not scene.plane_uncertain:
         return poses.new_zeros(len(who))
     with torch.no_grad():
-        origin = (poses[:, :3, :3] @ scene.object_center.to(poses)[:, :, None])[:, :, 0] + poses[:, :3, 3]
+        origin = scene.centers(poses)
         image = scene.image.to(poses.device)
         weight = acts.to(poses)
         count = poses.new_zeros(scene.n_images).index_add(0, image, weight).clamp_min(1)

@@ -54,8 +54,7 @@ def make_prior(
     if config.depth_factor != 1.0:
         measured = measured.clone()
         measured[:, :3, 3] *= config.depth_factor
-    center = scene.object_center.to(measured)
-    ray = (measured[:, :3, :3] @ center[:, :, None])[:, :, 0] + measured[:, :3, 3]
+    ray = scene.centers(measured)
     if covariance is None:
         covariance = pose_covariance(measured.double(), scene.object_center.to(measured.device), config)
     else:

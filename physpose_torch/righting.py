@@ -11,7 +11,7 @@ from physpose_torch import se3
 from physpose_torch.contacts import SUPPORT_SLOPE, plane_variance
 from physpose_torch.distance.autograd import signed_distance
 from physpose_torch.distance.broadphase import instance_bounds, meeting_pairs
-from physpose_torch.geometry.resting import resting_poses
+from physpose_torch.geometry.resting import nearest_rest
 from physpose_torch.losses import PhysicsTerms, prior_loss
 from physpose_torch.prior import PosePrior
 from physpose_torch.report import PhysicsReport, report_of
@@ -68,16 +68,9 @@ def find_fallen(
         limit: largest turn [rad].
         backend: distance backend.
     """
-    n = len(scene)
     up = -scene.gravity.to(poses)[scene.image.to(poses.device)]
     local = (poses[:, :3, :3].mT @ up[:, :, None])[:, :, 0]
-    target, tilt = local.clone(), poses.new_full((n,), torch.inf)
-    for body in dict.fromkeys(scene.objects):
-        rest = resting_poses(body).up.to(poses)
-        if len(rest):
-            rows = torch.tensor([i for i, other in enumerate(scene.objects) if other is body], device=poses.device)
-            cosine, best = (local[rows] @ rest.mT).max(1)
-            tilt[rows], target[rows] = torch.arccos(cosine.clamp(-1.0, 1.0)), rest[best]
+    tilt, target, *_ = nearest_rest(scene.objects, local)
     doubtful = (tilt > ASKEW) & (tilt <= limit) & (gap <= NEAR)  # NaN without gravity
     if bool(doubtful.any()):
         # most images have nothing to look at

@@ -294,6 +294,10 @@ class Scene:
         who, which = _ranges((count.cumsum(0) - count)[self.image], count[self.image])
         return torch.stack([who, order[which]], dim=1)
 
+    def centers(self, poses: Tensor) -> Tensor:
+        """(N, 3) centres of the objects' bounds at poses (N, 4, 4), camera frame [m]; viewing rays go there."""
+        return (poses[:, :3, :3] @ self.object_center.to(poses)[:, :, None])[:, :, 0] + poses[:, :3, 3]
+
     def entity_poses(self, poses: Tensor) -> Tensor:
         """(N + S, 4, 4): the objects' poses, then those of the static bodies."""
         if not self.static_bodies:

@@ -14,6 +14,19 @@ OBJECTS = {
     9: ([50.0, 90.0, 70.0], {"symmetries_discrete": [[-1, 0, 0, 4.0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]]}),
 }
 K = [600.0, 0, 330.0, 0, 610.0, 236.0, 0, 0, 1]
+TILT = np.deg2rad(40)
+UP = np.array([0.0, -np.cos(TILT), -np.sin(TILT)])
+OFFSET_MM = -400.0
+
+
+def standing(x, y, height):
+    """T_camera_object [mm] of an object at (x, y) on the table, its origin at a height."""
+    X = np.array([1.0, 0, 0])
+    T = np.eye(4)
+    T[:3, :3] = np.stack([X, np.cross(UP, X), UP], axis=1)
+    T[:3, 3] = T[:3, :3] @ [x, y, height] + UP * OFFSET_MM + [0, 0, 600]
+    T[:3, 3] += UP * (OFFSET_MM + height - T[:3, 3] @ UP)
+    return T
 
 
 def random_pose(rng):

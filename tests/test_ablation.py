@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from bop_files import HEADER, csv_row, metres, write_models, write_scene
+from bop_files import HEADER, OFFSET_MM, UP, csv_row, metres, standing, write_models, write_scene
 
 from physpose_torch.__main__ import main
 from physpose_torch.ablation import (
@@ -33,19 +33,6 @@ from physpose_torch.scene import Scene, Static
 
 ALWAYS = {"input", "one depth factor", "slide onto the plane", "P + C + G"}
 CALIBRATION = Calibration(0.98, sigma_ray_fraction=0.01, sigma_lateral=0.002, sigma_rotation=0.02)
-TILT = np.deg2rad(40)
-UP = np.array([0.0, -np.cos(TILT), -np.sin(TILT)])
-OFFSET_MM = -400.0
-
-
-def standing(x, y, height):
-    """T_camera_object [mm] of an object at (x, y) on the table, its origin at a height."""
-    right = np.array([1.0, 0, 0])
-    T = np.eye(4)
-    T[:3, :3] = np.stack([right, np.cross(UP, right), UP], axis=1)
-    T[:3, 3] = T[:3, :3] @ [x, y, height] + [0, 0, 600]
-    T[:3, 3] += UP * (OFFSET_MM + height - T[:3, 3] @ UP)
-    return T
 
 
 @pytest.fixture

@@ -6,24 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from bop_files import HEADER, csv_row, write_models, write_scene
+from bop_files import HEADER, OFFSET_MM, UP, csv_row, standing, write_models, write_scene
 
 from physpose_torch.__main__ import main
 from physpose_torch.bop.formats import read_estimates
-
-TILT = np.deg2rad(40)
-UP = np.array([0.0, -np.cos(TILT), -np.sin(TILT)])
-OFFSET_MM = -400.0
-
-
-def standing(x, y, height):
-    """T_camera_object [mm] of an object at (x, y) on the table, its origin at a height."""
-    X = np.array([1.0, 0, 0])
-    T = np.eye(4)
-    T[:3, :3] = np.stack([X, np.cross(UP, X), UP], axis=1)
-    T[:3, 3] = T[:3, :3] @ [x, y, height] + UP * OFFSET_MM + [0, 0, 600]
-    T[:3, 3] += UP * (OFFSET_MM + height - T[:3, 3] @ UP)
-    return T
 
 
 def farther(T, factor):

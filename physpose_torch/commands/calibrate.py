@@ -8,10 +8,11 @@ from pathlib import Path
 import torch
 
 from physpose_torch.bop.calibration import write_calibration
+from physpose_torch.bop.formats import Estimates
 from physpose_torch.bop.scenes import ImageScene, poses_of
 from physpose_torch.calibrate import Observations, calibrate, observe
 from physpose_torch.commands.common import check_output, progress, table
-from physpose_torch.commands.images import ImageOptions, in_batches
+from physpose_torch.commands.images import ImageOptions, in_batches, together
 from physpose_torch.config import Calibration
 from physpose_torch.errors import InvalidInputError
 from physpose_torch.scene import Scene
@@ -56,10 +57,9 @@ class Calibrate(ImageOptions):
         observations, clusters, problems = [], [], []
         with progress(opened.count, "look", "image", quiet=self.quiet) as bar:
             for batch in in_batches(opened.scenes, self.batch):
-                ready = [image for image in batch if image.scene is not None]
-                if ready:
-                    observations.append(self._observe(ready, opened.estimates))
-                    clusters += [image.scene_id for image in ready]
+                for seen, scenes in together(batch, lambda images: _observe(images, opened.estimates)):
+                    observations.append(seen)
+                    clusters += scenes
                 problems += [problem for image in batch for problem in image.problems]
                 bar.update(len(batch))
         for problem in problems:
@@ -80,9 +80,12 @@ class Calibrate(ImageOptions):
             print(f"\nwritten: {self.out}")
         return 1 if problems else 0
 
-    def _observe(self, images: Sequence[ImageScene], estimates) -> Observations:
-        poses, scores = poses_of(images, estimates)
-        return observe(poses, Scene.cat([image.scene for image in images]), scores=scores)
+
+def _observe(images: Sequence[ImageScene], estimates: Estimates) -> tuple[Observations, list[int]]:
+    """What images say, and the scene that each is in."""
+    poses, scores = poses_of(images, estimates)
+    seen = observe(poses, Scene.cat([image.scene for image in images]), scores=scores)
+    return seen, [image.scene_id for image in images]
 
 
 def _describe(calibration: Calibration) -> str:

@@ -1,10 +1,10 @@
 """What commands over the images of a result file share: their options, opening the files, and images by the batch."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, TypeVar
 
 import numpy as np
 import tyro
@@ -12,9 +12,12 @@ import tyro
 from physpose_torch.bop.dataset import BopDataset
 from physpose_torch.bop.formats import Estimates, read_estimates, read_planes, read_statics
 from physpose_torch.bop.scenes import BodyLibrary, ImageScene, image_scenes
-from physpose_torch.errors import InvalidInputError
+from physpose_torch.errors import InvalidInputError, PhysPoseError
 
-__all__ = ["ImageOptions", "Images", "in_batches"]
+__all__ = ["ImageOptions", "Images", "in_batches", "together"]
+
+
+T = TypeVar("T")
 
 
 class Images(NamedTuple):
@@ -118,3 +121,17 @@ def in_batches(images: Iterable[ImageScene], size: int) -> Iterator[list[ImageSc
             batch, ready = [], 0
     if batch:
         yield batch
+
+
+def together(images: Iterable[ImageScene], work: Callable[[Sequence[ImageScene]], T]) -> list[T]:
+    """What ``work`` makes of those images that have a scene; if it refuses, of each, so that only the culprit is left out."""
+    images = [i for i in images if i.scene is not None]
+    if not images:
+        return []
+    try:
+        return [work(images)]
+    except PhysPoseError as error:
+        if len(images) == 1:
+            images[0].problems.append(f"{images[0].name}: {error}")
+            return []
+        return [made for i in images for made in together([i], work)]

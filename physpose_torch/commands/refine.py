@@ -13,9 +13,8 @@ import torch
 from physpose_torch.bop.formats import Estimates, write_estimates
 from physpose_torch.bop.scenes import ImageScene, poses_of
 from physpose_torch.commands.common import check_output, describe, progress
-from physpose_torch.commands.images import ImageOptions, in_batches
+from physpose_torch.commands.images import ImageOptions, in_batches, together
 from physpose_torch.config import RefinerConfig
-from physpose_torch.errors import PhysPoseError
 from physpose_torch.refiner import PhysPoseRefiner
 from physpose_torch.report import PhysicsReport, physics_report
 from physpose_torch.scene import Scene
@@ -58,7 +57,7 @@ class Refine(ImageOptions):
         righted = 0
         with progress(total, "refine", "image", quiet=self.quiet) as bar:
             for batch in in_batches(todo, self.batch):
-                for group in self._run([i for i in batch if i.scene is not None], estimates, refiner):
+                for group in together(batch, lambda images: _refine(images, estimates, refiner)):
                     rows = np.concatenate([i.rows for i in group.images])
                     poses[rows] = group.poses
                     seconds[rows] = group.seconds / len(group.images)
@@ -89,18 +88,6 @@ class Refine(ImageOptions):
         for problem in problems:
             logger.error(problem)
         return 1 if problems else 0
-
-    def _run(self, images: Sequence[ImageScene], estimates: Estimates, refiner: PhysPoseRefiner) -> "list[_Group]":
-        """Refine images as one batch; if that fails, one by one, so that only the culprit is left out."""
-        if not images:
-            return []
-        try:
-            return [_refine(images, estimates, refiner)]
-        except PhysPoseError as error:
-            if len(images) == 1:
-                images[0].problems.append(f"{images[0].name}: {error}")
-                return []
-            return [g for i in images for g in self._run([i], estimates, refiner)]
 
 
 @dataclass

@@ -12,8 +12,7 @@ import numpy as np
 from physpose_torch.bop.formats import Estimates
 from physpose_torch.bop.scenes import ImageScene, poses_of
 from physpose_torch.commands.common import check_output, progress
-from physpose_torch.commands.images import ImageOptions, in_batches
-from physpose_torch.errors import PhysPoseError
+from physpose_torch.commands.images import ImageOptions, in_batches, together
 from physpose_torch.losses import acting
 from physpose_torch.report import physics_report
 from physpose_torch.scene import Scene
@@ -55,7 +54,8 @@ class Report(ImageOptions):
         measured = 0
         with progress(total, "report", "image", quiet=self.quiet) as bar:
             for batch in in_batches(todo, self.batch):
-                rows += self._measure([i for i in batch if i.scene is not None], estimates)
+                for some in together(batch, lambda images: _rows(images, estimates, self.backend)):
+                    rows += some
                 problems += [p for i in batch for p in i.problems]
                 measured += sum(not i.problems for i in batch)
                 bar.update(len(batch))
@@ -67,18 +67,6 @@ class Report(ImageOptions):
         for problem in problems:
             logger.error(problem)
         return 1 if problems else 0
-
-    def _measure(self, images: Sequence[ImageScene], estimates: Estimates) -> list[Row]:
-        """Measure images as one batch; if that fails, one by one, so that only the culprit is left out."""
-        if not images:
-            return []
-        try:
-            return _rows(images, estimates, self.backend)
-        except PhysPoseError as error:
-            if len(images) == 1:
-                images[0].problems.append(f"{images[0].name}: {error}")
-                return []
-            return [row for i in images for row in self._measure([i], estimates)]
 
 
 def _rows(images: Sequence[ImageScene], estimates: Estimates, backend: str) -> list[Row]:

@@ -1,6 +1,7 @@
 """The ways in which a body can stand on a level surface."""
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from physpose_torch.geometry.body import Body
 
-__all__ = ["RestingPoses", "resting_poses"]
+__all__ = ["NearestRest", "RestingPoses", "nearest_rest", "resting_poses"]
 
 WOBBLE = math.radians(2.0)
 """A corner counts as touching if the body would stand on it when tilted by this: scans are not flat, and balls roll."""
@@ -33,6 +34,35 @@ class RestingPoses(NamedTuple):
     """(S,) of the centre of the bounds above the surface [m]."""
     apart: Tensor
     """(S,) angle to the nearest other one [rad]; π if there is none."""
+
+
+class NearestRest(NamedTuple):
+    """The stable pose that each object's pose is nearest to; see :class:`RestingPoses`."""
+
+    tilt: Tensor
+    """(N,) angle to it [rad]; infinite where the body has none."""
+    up: Tensor
+    """(N, 3)."""
+    height: Tensor
+    """(N,) [m]."""
+    apart: Tensor
+    """(N,) [rad]."""
+
+
+def nearest_rest(bodies: Sequence[Body], up: Tensor) -> NearestRest:
+    """The nearest stable poses of bodies, given what is up (N, 3) in the frame of each."""
+    tilt, height, apart = (up.new_full((len(bodies),), torch.inf) for _ in range(3))
+    nearest = up.clone()
+    members: dict[Body, list[int]] = {}
+    for i, body in enumerate(bodies):
+        members.setdefault(body, []).append(i)
+    for body, rows in members.items():
+        rest = RestingPoses(*(x.to(up) for x in resting_poses(body)))
+        if len(rest.up):
+            cosine, best = (up[rows] @ rest.up.mT).max(1)
+            tilt[rows] = torch.arccos(cosine.clamp(-1.0, 1.0))
+            nearest[rows], height[rows], apart[rows] = rest.up[best], rest.height[best], rest.apart[best]
+    return NearestRest(tilt, nearest, height, apart)
 
 
 @lru_cache(maxsize=256)
