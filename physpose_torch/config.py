@@ -7,7 +7,7 @@ from typing import Literal
 
 from physpose_torch.errors import InvalidInputError
 
-__all__ = ["STILL_STEPS", "Calibration", "PhysicsConfig", "RefinerConfig", "Smoothing"]
+__all__ = ["STILL_STEPS", "Calibration", "PhysicsConfig", "RefinerConfig", "Smoothing", "TableConfig"]
 
 STILL_STEPS = 10
 """An image stops after this many steps of a descent on end without motion."""
@@ -240,4 +240,58 @@ class RefinerConfig:
             decay="none",
             max_gradient=1.0,
             tolerance=0.0,
+        )
+
+
+@dataclass(frozen=True)
+class TableConfig:
+    """How the table plane is estimated from images and object poses. Lengths in metres, angles in radians."""
+
+    method: Literal["auto", "joint", "support", "homography", "paper"] = "auto"
+    """``joint``: least squares over all there is. ``support``: the objects' stable faces and bottoms, no image. ``homography``:
+    the table's homography between the views. ``paper``: reconstruct, scale by the objects, fit a plane. ``auto``: joint, or
+    support where there are no images to look at."""
+    features: Literal["auto", "xfeat", "sift"] = "auto"
+    """Which matches to start from. ``auto``: XFeat where it is installed (extra ``table``), else SIFT."""
+    align: bool = True
+    """Align the objects with the images, by their colours where the meshes have some and by their outlines."""
+    sigma_lateral: float = 0.0025
+    """Standard deviation of an estimated pose across its viewing ray, per axis [m]."""
+    sigma_ray_fraction: float = 0.015
+    """Standard deviation along the ray, as a fraction of the range."""
+    sigma_rotation: float = math.radians(1.5)
+    """Standard deviation of an estimated rotation, per axis [rad]."""
+    sigma_depth_common: float = 0.025
+    """Standard deviation of the depth factor that all estimates share; only images can tell it."""
+    sigma_surface: float = 0.0007
+    """Standard deviation of real surfaces from the meshes [m]."""
+    sigma_contact: float = 0.001
+    """Standard deviation of the gap between what stands and the table [m]: neither is flat."""
+    sigma_gravity: float = math.radians(1.0)
+    """Standard deviation of a known gravity direction, per axis [rad]."""
+    widest_tilt: float = math.radians(4.0)
+    """A plane that is known no better than this, per axis [rad], is refused …"""
+    widest_offset: float = 0.025
+    """… as is one whose height at the objects is known no better than this [m]."""
+    seed: int = 0
+    """Seed of RANSAC."""
+
+    def __post_init__(self) -> None:
+        if self.method not in ("auto", "joint", "support", "homography", "paper"):
+            raise InvalidInputError(
+                f"TableConfig.method = {self.method!r}, expected auto, joint, support, homography or paper"
+            )
+        if self.features not in ("auto", "xfeat", "sift"):
+            raise InvalidInputError(f"TableConfig.features = {self.features!r}, expected auto, xfeat or sift")
+        _check_positive(
+            self,
+            "sigma_lateral",
+            "sigma_ray_fraction",
+            "sigma_rotation",
+            "sigma_depth_common",
+            "sigma_surface",
+            "sigma_contact",
+            "sigma_gravity",
+            "widest_tilt",
+            "widest_offset",
         )

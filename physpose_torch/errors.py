@@ -1,6 +1,14 @@
 """What this package raises on purpose; each error is also the builtin that callers would expect."""
 
-__all__ = ["BackendError", "DataError", "InvalidInputError", "MissingExtraError", "PhysPoseError", "UnknownLabelError"]
+__all__ = [
+    "BackendError",
+    "DataError",
+    "InvalidInputError",
+    "MissingExtraError",
+    "PhysPoseError",
+    "TableNotFoundError",
+    "UnknownLabelError",
+]
 
 
 class PhysPoseError(Exception):
@@ -28,3 +36,7 @@ class MissingExtraError(PhysPoseError, ImportError):
 
 class BackendError(PhysPoseError, RuntimeError):
     """A distance backend or a child process failed."""
+
+
+class TableNotFoundError(PhysPoseError, RuntimeError):
+    """The images and poses do not tell where the table is; the message says what was missing."""

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import trimesh
+from scipy.spatial import QhullError
 from torch import Tensor
 
 from physpose_torch import se3
@@ -33,6 +34,8 @@ class Body:
     """(S, 4, 4) transforms of the body frame that leave the body as it is, identity included; None: no symmetry."""
     decomposition: DecomposeReport | None = None
     """How well the parts cover the mesh; None where the shape is exact."""
+    appearance: trimesh.Trimesh | None = None
+    """The surface mesh with its colours (texture, vertices or faces), body frame [m]; None: no colours are known."""
 
     @classmethod
     def from_mesh(
@@ -59,14 +62,35 @@ class Body:
             DataError: the file is missing or cannot be read, or the mesh has no faces, NaN, or no volume.
             InvalidInputError: it is larger than 10 m or smaller than 1 mm, as in other units; an option is unknown.
         """
-        mesh = load_mesh(mesh, label=label, scale=scale)
+        raw = _read_mesh(mesh, label)
+        mesh = load_mesh(raw, label=label, scale=scale)
         try:
             options = DecomposeOptions(**coacd_options)
         except TypeError as error:
             known = ", ".join(DecomposeOptions.__dataclass_fields__)
             raise InvalidInputError(f"{label}: {error}; decomposition options are {known}") from error
         hulls, report = decompose(mesh, options, cache=cache, name=label)
-        return cls(label, ConvexParts.from_hulls(hulls), mesh, _checked_symmetries(symmetries, label), report)
+        symmetries, appearance = _checked_symmetries(symmetries, label), _appearance(raw, scale)
+        return cls(label, ConvexParts.from_hulls(hulls), mesh, symmetries, report, appearance)
+
+    @classmethod
+    def from_hull(
+        cls, mesh: trimesh.Trimesh | str | Path, *, label: str, scale: float = 1.0, symmetries: Tensor | None = None
+    ) -> "Body":
+        """The same with its convex hull as the only part: no decomposition to wait for. What asks for nothing but the surface
+        and what the body can stand on, as the table estimator, needs no more.
+
+        Raises:
+            DataError: the file is missing or cannot be read, or the mesh has no faces, NaN, or no volume.
+        """
+        raw = _read_mesh(mesh, label)
+        mesh = load_mesh(raw, label=label, scale=scale)
+        try:
+            corners = np.asarray(mesh.convex_hull.vertices)
+        except QhullError:
+            raise DataError(f"{label}: the mesh is flat; a body needs a volume") from None
+        parts = ConvexParts.from_hulls([corners])
+        return cls(label, parts, mesh, _checked_symmetries(symmetries, label), None, _appearance(raw, scale))
 
     @classmethod
     def box(cls, extents, *, label: str) -> "Body":
@@ -169,6 +193,17 @@ def load_mesh(mesh: trimesh.Trimesh | str | Path, *, label: str, scale: float = 
     """
     if not (np.isfinite(scale) and scale > 0):
         raise InvalidInputError(f"{label}: scale = {scale}, expected a positive factor to metres (0.001 for mm)")
+    mesh = _read_mesh(mesh, label)
+    # only geometry is kept: texture seams would split vertices
+    out = trimesh.Trimesh(np.asarray(mesh.vertices, dtype=np.float64) * scale, mesh.faces, process=False)
+    if not np.isfinite(out.vertices).all():
+        raise DataError(f"{label}: the mesh has NaN or infinite vertices")
+    out.merge_vertices(merge_tex=True, merge_norm=True)
+    return out
+
+
+def _read_mesh(mesh: trimesh.Trimesh | str | Path, label: str) -> trimesh.Trimesh:
+    """The mesh as it is in the file, or as it was given."""
     if isinstance(mesh, str | Path):
         path = Path(mesh)
         if not path.is_file():
@@ -185,12 +220,20 @@ def load_mesh(mesh: trimesh.Trimesh | str | Path, *, label: str, scale: float = 
         )
     if len(mesh.faces) == 0:
         raise DataError(f"{label}: the mesh has no faces; convex parts need a surface")
-    # only geometry is kept: texture seams would split vertices, and visuals are not ours to copy
-    out = trimesh.Trimesh(np.asarray(mesh.vertices, dtype=np.float64) * scale, mesh.faces, process=False)
-    if not np.isfinite(out.vertices).all():
-        raise DataError(f"{label}: the mesh has NaN or infinite vertices")
-    out.merge_vertices(merge_tex=True, merge_norm=True)
-    return out
+    return mesh
+
+
+def _appearance(mesh: trimesh.Trimesh, scale: float) -> trimesh.Trimesh | None:
+    """The mesh with its colours, in metres; None if it has none."""
+    visual = mesh.visual
+    if visual is None or not visual.defined:
+        return None
+    if visual.kind == "texture":
+        material = visual.material
+        image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+        if visual.uv is None or image is None or len(visual.uv) != len(mesh.vertices):
+            return None
+    return trimesh.Trimesh(np.asarray(mesh.vertices) * scale, mesh.faces, visual=visual.copy(), process=False)
 
 
 def _is_covariance(matrix: Tensor) -> bool:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from physpose_torch.geometry.body import Body
 
-__all__ = ["NearestRest", "RestingPoses", "nearest_rest", "resting_poses"]
+__all__ = ["HullStands", "NearestRest", "RestingPoses", "hull_stands", "nearest_rest", "resting_poses"]
 
 WOBBLE = math.radians(2.0)
 """A corner counts as touching if the body would stand on it when tilted by this: scans are not flat, and balls roll."""
@@ -23,6 +23,17 @@ ALIKE = math.radians(10.0)
 """Poses nearer to each other than this are one; that with the lowest centre of mass stands for them."""
 DIRECTIONS = 64
 """Sides to which the body may tip."""
+
+
+class HullStands(NamedTuple):
+    """A body's convex hull, and the faces of it that have the centre of mass over them, however small."""
+
+    corners: np.ndarray
+    """(V, 3) of the hull, body frame [m]."""
+    center: np.ndarray
+    """(3,) centre of mass."""
+    up: np.ndarray
+    """(F, 3) what points up when the body stands on each, the one with the lowest centre of mass first."""
 
 
 class RestingPoses(NamedTuple):
@@ -66,19 +77,13 @@ def nearest_rest(bodies: Sequence[Body], up: Tensor) -> NearestRest:
 
 
 @lru_cache(maxsize=256)
-def resting_poses(body: Body) -> RestingPoses:
-    """Faces of the convex hull of a body's mesh on which it stands with a base to speak of; none for a ball.
-
-    The centre of mass over a face is where the body comes to rest; faces that it would leave at a touch (the side of a can,
-    the edge of a plate) do not count.
-    """
+def hull_stands(body: Body) -> HullStands | None:
+    """On which faces of its convex hull a body can stand, if only for a moment; None if it is flat, or a line."""
     try:
         hull = trimesh.Trimesh(body.mesh.vertices, body.mesh.faces, process=False).convex_hull
-    except QhullError:  # flat, or a line
-        none = torch.zeros(0, dtype=torch.float64)
-        return RestingPoses(none.reshape(0, 3), none, none)
-    corners = np.asarray(hull.vertices)
-    center, radius = body.center_of_mass.numpy(), body.radius
+    except QhullError:
+        return None
+    center = body.center_of_mass.numpy()
     triangles, normals = np.asarray(hull.triangles), np.asarray(hull.face_normals)
     depth = ((triangles[:, 0] - center) * normals).sum(1)
     foot = center + depth[:, None] * normals
@@ -86,9 +91,24 @@ def resting_poses(body: Body) -> RestingPoses:
     over = (np.cross(sides, foot[:, None] - triangles) * normals[:, None]).sum(2)
     scale = np.linalg.norm(sides, axis=2).max(1, keepdims=True) ** 2
     standing = np.flatnonzero((over >= -1e-9 * scale).all(1))
+    standing = standing[np.argsort(depth[standing], kind="stable")]
+    return HullStands(np.asarray(hull.vertices), center, -normals[standing])
+
+
+@lru_cache(maxsize=256)
+def resting_poses(body: Body) -> RestingPoses:
+    """Faces of the convex hull of a body's mesh on which it stands with a base to speak of; none for a ball.
+
+    The centre of mass over a face is where the body comes to rest; faces that it would leave at a touch (the side of a can,
+    the edge of a plate) do not count.
+    """
+    stands = hull_stands(body)
+    if stands is None:
+        none = torch.zeros(0, dtype=torch.float64)
+        return RestingPoses(none.reshape(0, 3), none, none)
+    corners, center, radius = stands.corners, stands.center, body.radius
     chosen: list[np.ndarray] = []
-    for face in standing[np.argsort(depth[standing], kind="stable")]:
-        up = -normals[face]
+    for up in stands.up:
         if all(up @ other < math.cos(ALIKE) for other in chosen) and _base(corners - center, up) > LEAST_BASE * radius:
             chosen.append(up)
     up = torch.from_numpy(np.array(chosen).reshape(-1, 3))

@@ -1,0 +1,299 @@
+"""What is known about objects, cameras and table: the terms of the adjustment, each a whitened residual.
+
+Residuals are functions of unknowns that may have leading dimensions (...), which they keep.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from physpose_torch.config import TableConfig
+from physpose_torch.distance.smoothing import tangent_basis
+from physpose_torch.table.adjustment import State, Unknowns
+from physpose_torch.table.standing import FEET, Feet
+from physpose_torch.table.view import pixel_rays, project
+
+__all__ = [
+    "CommonDepth",
+    "Contact",
+    "Gravity",
+    "NotBelow",
+    "ModelPoints",
+    "Outlines",
+    "PlaneMatches",
+    "PosePrior",
+    "SurfaceMatches",
+    "few",
+]
+
+
+LEANING = math.radians(20.0)
+"""What is tilted by more than this from all faces it could stand on stands on none."""
+FAR = 0.05
+"""[m]; as unlikely as standing so far above the table is leaning."""
+INDEPENDENT = 300.0
+"""Matches on the table count as this many at the most: neither lenses nor tables are perfect."""
+GATE = 4.0
+"""Standard deviations within which a match may be on the plane …"""
+SLACK = 0.5
+"""… with so much to spare [px]."""
+
+
+def few(owner: Tensor, most: float) -> Tensor:
+    """Weights (G,) that let the rows of one object (or all rows, owner 0) count for at most so many independent ones."""
+    count = torch.bincount(owner).clamp_min(1).double()
+    return (most / count).clamp_max(1.0)[owner]
+
+
+def _seen(x: Unknowns, view: int, owner: Tensor, points: Tensor) -> Tensor:
+    """Points (G, 3) of objects, in a view's camera frame (..., G, 3)."""
+    R, t = x.pose(view)
+    return _turned(R[..., owner, :, :], points) + t[..., owner, :]
+
+
+def _turned(R: Tensor, vectors: Tensor) -> Tensor:
+    return (R * vectors[..., None, :]).sum(-1)
+
+
+def _moved(x: Unknowns, points: Tensor) -> Tensor:
+    """Points (..., G, 3) of view 0 in view 1."""
+    return points @ x.R10.mT + x.t10[..., None, :]
+
+
+@dataclass(frozen=True, eq=False)
+class PosePrior:
+    """The estimated poses of one view (paper, Eq. 2, with a factor that all depths share)."""
+
+    view: int
+    measured: Tensor
+    """(G, 4, 4), of the objects that were seen."""
+    center: Tensor
+    """(G, 3) of their bounds, object frame; viewing rays go there [m]."""
+    owner: Tensor
+    config: TableConfig
+    weight: float = 1.0
+    nu: float = 8.0
+
+    def residual(self, x: Unknowns) -> Tensor:
+        """(G, 6): along the ray, across it, rotation."""
+        R, t = (v[..., self.owner, :, :] for v in (x.pose(self.view)[0], x.pose(self.view)[1][..., None]))
+        measured = _turned(self.measured[:, :3, :3], self.center) + self.measured[:, :3, 3]
+        distance = torch.linalg.vector_norm(measured, dim=1, keepdim=True)
+        ray = measured / distance
+        off = _turned(R, self.center) + t[..., 0] - x.depth_factor[..., None, None] * measured
+        along = (off * ray).sum(-1, keepdim=True) / (self.config.sigma_ray_fraction * distance)
+        across = (tangent_basis(ray) @ off[..., None])[..., 0] / self.config.sigma_lateral
+        turn = self.measured[:, :3, :3].mT @ R
+        turn = 0.5 * (turn - turn.mT)  # sine times axis: all that is needed near the estimate
+        turn = torch.stack([turn[..., 2, 1], turn[..., 0, 2], turn[..., 1, 0]], -1) / self.config.sigma_rotation
+        return torch.cat([along, across, turn], -1)
+
+
+@dataclass(frozen=True, eq=False)
+class Contact:
+    """Objects stand on the table, with the feet of one face each."""
+
+    feet: Feet
+    owner: Tensor
+    sigma: float
+    cost: float = 0.0
+    """Of the objects that stand on nothing, so that planes can be compared by how many stand on them."""
+    weight: float = 1.0
+    nu: float = 4.0
+
+    @classmethod
+    def of(cls, feet: Feet, sigma: float) -> "Contact":
+        """All objects that do not lean too much; those that do cost as much as those that are far above."""
+        owner = (feet.tilt < LEANING).nonzero()[:, 0]
+        elsewhere = 0.5 * (cls.nu + FEET) * math.log1p((FAR / sigma) ** 2 / cls.nu)
+        leaning = int(feet.tilt.isfinite().sum()) - len(owner)
+        return cls(feet, owner, sigma, leaning * elsewhere)
+
+    def residual(self, x: Unknowns) -> Tensor:
+        """(G, FEET): heights above where they belong; three of them would say all."""
+        points, rest = self.feet.points[self.owner], self.feet.rest[self.owner]
+        up = (x.R[..., self.owner, :, :] * x.normal[..., None, :, None]).sum(-2)
+        level = (x.t[..., self.owner, :] * x.normal[..., None, :]).sum(-1) - x.offset[..., None]
+        height = (points * up[..., None, :]).sum(-1) + level[..., None]
+        return (height - rest) * (math.sqrt(3.0 / FEET) / self.sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class NotBelow:
+    """Nothing is below the table, whatever it stands on."""
+
+    lowest: Tensor
+    """(G, 3) the lowest point of each object, object frame [m]."""
+    owner: Tensor
+    sigma: float
+    weight: float = 1.0
+    nu: float = 30.0
+
+    def residual(self, x: Unknowns) -> Tensor:
+        """(G, 1): how deep each is."""
+        height = (_seen(x, 0, self.owner, self.lowest) * x.normal[..., None, :]).sum(-1) - x.offset[..., None]
+        return height.clamp_max(0.0)[..., None] / self.sigma
+
+
+@dataclass(frozen=True, eq=False)
+class CommonDepth:
+    """The factor that all estimated depths are off by."""
+
+    sigma: float
+    owner: None = None
+    weight: float = 1.0
+    nu: float = math.inf
+
+    def residual(self, x: Unknowns) -> Tensor:
+        """(1, 1)."""
+        return ((x.depth_factor - 1.0) / self.sigma)[..., None, None]
+
+
+@dataclass(frozen=True, eq=False)
+class Gravity:
+    """The table is level, and what is down is known."""
+
+    down: Tensor
+    """(3,) unit vector, view 0."""
+    sigma: float
+    owner: None = None
+    weight: float = 1.0
+    nu: float = math.inf
+
+    def residual(self, x: Unknowns) -> Tensor:
+        """(1, 2)."""
+        return (x.normal @ tangent_basis(-self.down[None])[0].mT / self.sigma)[..., None, :]
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneMatches:
+    """Matches off the objects: on the epipolar line, wherever they are; and where the plane puts them, if they are on it.
+
+    A match is a point in view 0 and, known less well, one in view 1. The plane moves it along its epipolar line only, so the
+    two directions tell of different things and are rows of their own, each with its own weight.
+    """
+
+    rays: Tensor
+    """(M, 3) of the points in view 0."""
+    points_1: Tensor
+    """(M, 2) [px]."""
+    whitening: Tensor
+    """(M, 2, 2): across the epipolar line, then along it given that; of the state it was made for."""
+    K1: Tensor
+    weight: Tensor
+    cost: float = 0.0
+    """Of the matches that cannot be on the plane, so that planes can be compared by how many are on them."""
+    nu: float = 4.0
+    owner: None = None
+
+    @classmethod
+    def of(
+        cls, state: State, plane: Tensor, K0: Tensor, K1: Tensor, points_0: Tensor, points_1: Tensor, covariance: Tensor
+    ) -> "PlaneMatches":
+        """Matches (M, 2), (M, 2) with covariances (M, 2, 2) [px²] of the second.
+
+        Where a match lies along its epipolar line counts only if it may be on the plane, as well as that is known: with
+        covariance ``plane`` (3, 3). There are other planes in the world, a floor above all, and more of them is seen.
+        """
+        rays = pixel_rays(K0, points_0)
+        near = (state.offset / (rays @ state.normal))[:, None] * rays
+        R, t = state.T_view1_view0[:3, :3], state.T_view1_view0[:3, 3]
+        where = project(K1, near @ R.mT + t)
+        along = (project(K1, 1.01 * near @ R.mT + t) - where) / 0.01
+        length = torch.linalg.vector_norm(along, dim=1, keepdim=True)
+        along = torch.where(length > 1e-9, along / length.clamp_min(1e-9), along.new_tensor([1.0, 0.0]))
+        turn = torch.stack([torch.stack([-along[:, 1], along[:, 0]], 1), along], 1)
+        turned = turn @ covariance @ turn.mT
+        whitening = torch.linalg.solve_triangular(torch.linalg.cholesky(turned), turn, upper=False)
+
+        lever = (near - state.middle) @ tangent_basis(state.normal[None])[0].mT
+        lever = torch.cat([lever, torch.ones_like(lever[:, :1])], 1)
+        # a plane that is higher by h is nearer by h / offset of the depth
+        wander = torch.einsum("mi,ij,mj->m", lever, plane, lever) * (length[:, 0] / state.offset) ** 2
+        off = ((where - points_1) * along).sum(1)
+        across = few(torch.zeros(len(rays), dtype=torch.int64), INDEPENDENT)
+        on = off**2 < GATE**2 * (turned[:, 1, 1] + wander + SLACK**2)
+        along = torch.where(on, few(torch.zeros(int(on.sum()), dtype=torch.int64), INDEPENDENT).sum() / on.sum(), 0.0)
+        elsewhere = 0.5 * (cls.nu + 1) * math.log1p(GATE**2 / cls.nu)
+        cost = elsewhere * float(across[~on].sum())
+        return cls(rays, points_1, whitening, K1, torch.cat([across, along]), cost)
+
+    def residual(self, x: Unknowns) -> Tensor:
+        """(2 M, 1): all that is across, then all that is along."""
+        depth = x.offset[..., None] / (x.normal @ self.rays.mT)
+        off = project(self.K1, _moved(x, depth[..., None] * self.rays)) - self.points_1
+        return _turned(self.whitening, off).mT.flatten(-2)[..., None]
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceMatches:
+    """Matches on objects: the ray of view 0 meets the surface, and view 1 sees that point. No colours are needed."""
+
+    rays: Tensor
+    """(M, 3) of the points in view 0."""
+    points_1: Tensor
+    """(M, 2) [px]."""
+    surface: Tensor
+    """(M, 3) a point of the face that is met, object frame [m]."""
+    normal: Tensor
+    """(M, 3) of that face, object frame."""
+    whitening: Tensor
+    """(M, 2, 2)."""
+    owner: Tensor
+    K1: Tensor
+    weight: Tensor
+    nu: float = 4.0
+
+    def residual(self, x: Unknowns) -> Tensor:
+        """(M, 2)."""
+        surface = _seen(x, 0, self.owner, self.surface)
+        normal = _turned(x.R[..., self.owner, :, :], self.normal)
+        depth = (normal * surface).sum(-1) / (normal * self.rays).sum(-1)
+        off = project(self.K1, _moved(x, depth[..., None] * self.rays)) - self.points_1
+        return _turned(self.whitening, off)
+
+
+@dataclass(frozen=True, eq=False)
+class ModelPoints:
+    """Points of objects that were found in an image, by their colours."""
+
+    view: int
+    points: Tensor
+    """(M, 3) object frame [m]."""
+    pixels: Tensor
+    """(M, 2)."""
+    whitening: Tensor
+    """(M, 2, 2)."""
+    owner: Tensor
+    K: Tensor
+    weight: Tensor
+    nu: float = 4.0
+
+    def residual(self, x: Unknowns) -> Tensor:
+        """(M, 2)."""
+        off = project(self.K, _seen(x, self.view, self.owner, self.points)) - self.pixels
+        return _turned(self.whitening, off)
+
+
+@dataclass(frozen=True, eq=False)
+class Outlines:
+    """Points of objects' outlines that were found in an image, across the outline only."""
+
+    view: int
+    points: Tensor
+    """(M, 3) of the outline, object frame [m]."""
+    pixels: Tensor
+    """(M, 2) where the outline is in the image."""
+    across: Tensor
+    """(M, 2) unit normals of the outline, divided by the standard deviation [1/px]."""
+    owner: Tensor
+    K: Tensor
+    weight: Tensor
+    nu: float = 3.0
+
+    def residual(self, x: Unknowns) -> Tensor:
+        """(M, 1)."""
+        off = project(self.K, _seen(x, self.view, self.owner, self.points)) - self.pixels
+        return (off * self.across).sum(-1, keepdim=True)
