@@ -12,9 +12,10 @@ _HOMES = {
         "InvalidInputError",
         "MissingExtraError",
         "PhysPoseError",
+        "TableNotFoundError",
         "UnknownLabelError",
     ],
-    "config": ["Calibration", "PhysicsConfig", "RefinerConfig", "Smoothing"],
+    "config": ["Calibration", "PhysicsConfig", "RefinerConfig", "Smoothing", "TableConfig"],
     "geometry.convex": ["ConvexParts"],
     "geometry.decompose": ["DecomposeOptions"],
     "geometry.body": ["Body", "Plane"],
@@ -26,6 +27,8 @@ _HOMES = {
     "losses": ["PhysicsLoss", "PhysicsTerms", "collision_loss", "gravity_loss", "pose_covariance", "pose_loss"],
     "report": ["PhysicsReport", "physics_report"],
     "refiner": ["PhysPoseRefiner", "Refinement"],
+    "table.view": ["View"],
+    "table.estimator": ["TableEstimate", "TableEstimator"],
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 

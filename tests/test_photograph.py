@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from physpose_torch import photograph, se3
+from physpose_torch import photograph, printed, se3
 from physpose_torch.errors import InvalidInputError
 from physpose_torch.household import HOUSEHOLD_COLORS, household_meshes
 from physpose_torch.photograph import TABLES, household_pair
@@ -131,9 +131,9 @@ def test_pixel_centres_are_at_integers(size, axis):
     """A line on the table and an edge of a box, upright or level in the image, are where their points project to."""
     width, height = size
     K = torch.tensor([[0.95 * width, 0, 0.5 * width + 3.3], [0, 0.95 * width, 0.5 * height - 2.6], [0, 0, 1]]).double()
-    _, (vertices, faces, normals, colors) = photograph._coloured("box", np.random.default_rng(0))
+    _, (vertices, faces, normals, colors) = printed.coloured("box", np.random.default_rng(0))
     box = vertices, faces, normals, torch.full_like(colors, 0.95)
-    top = np.zeros((*(photograph._SIZE[::-1] / photograph._TEXEL).round().astype(int), 3))
+    top = np.zeros((*(printed.TOP_SIZE[::-1] / printed.TEXEL).round().astype(int), 3))
     top[:, top.shape[1] // 2 :] = 0.9  # bright where x > 0
     T_box = torch.eye(4, dtype=torch.float64)
     T_box[:3, 3] = torch.tensor([-0.2, 0.1, 0.105])
@@ -288,7 +288,7 @@ def test_noise_has_the_stated_size():
 
 @pytest.mark.parametrize("name", HOUSEHOLD_COLORS)
 def test_meshes_are_the_household_shapes_with_colours_two_millimetres_apart(name):
-    mesh, _ = photograph._coloured(name, np.random.default_rng(0))
+    mesh, _ = printed.coloured(name, np.random.default_rng(0))
     np.testing.assert_array_equal(mesh.bounds, SHAPES[name].bounds)
     assert mesh.is_watertight
     assert mesh.is_winding_consistent
@@ -296,7 +296,7 @@ def test_meshes_are_the_household_shapes_with_colours_two_millimetres_apart(name
     assert mesh.area == pytest.approx(SHAPES[name].area, rel=1e-9)
     assert mesh.edges_unique_length.max() <= 0.002
     assert mesh.visual.kind == "vertex"
-    other, _ = photograph._coloured(name, np.random.default_rng(1))
+    other, _ = printed.coloured(name, np.random.default_rng(1))
     assert not np.array_equal(mesh.visual.vertex_colors, other.visual.vertex_colors)
 
 

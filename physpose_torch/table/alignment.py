@@ -32,12 +32,18 @@ CLEAR = 8
 """Pixels outside an object's outline that do not count as table: estimates are off, and there are shadows."""
 INDEPENDENT = 20.0
 """Matches on one object count as this many at the most: a model's surface and texture are off in patches, not in points."""
-INDEPENDENT_OUTLINE = 30.0
+INDEPENDENT_OUTLINE = 8.0
 """The same for points of one outline in one view."""
 OUTLINE_STEP = 6
 """Pixels between points of an outline."""
-OUTLINE_SIGMA = 0.6
+OUTLINE_SIGMA = 1.0
 """[px], standard deviation of a point of an outline that has been found."""
+EXPECTED = 0.4
+"""Standard deviation of how far off an outline is, as a share of how far it is looked for."""
+EDGE = 1.5
+"""[px]; where colours change there is an edge this near …"""
+LEAST_EDGE = 10.0
+"""… of so many grey levels over two pixels."""
 BLURRED = 2.0
 """[px²]; where colours change less clearly than with this variance, there is no telling."""
 HISTOGRAM = 16
@@ -59,9 +65,9 @@ class Located(NamedTuple):
     """(M, 2, 2) of the second [px²]."""
 
     @classmethod
-    def of(cls, matches: Matches, grays: Sequence[Tensor], affine: Tensor | None = None) -> "Located":
-        """What of rough matches can be aligned; ``affine`` (M, 2, 2) tells how offsets map, if that is known."""
-        found = align_patches(*grays, matches.points_0, matches.points_1, affine=affine, deform=affine is None)
+    def of(cls, matches: Matches, grays: Sequence[Tensor]) -> "Located":
+        """What of rough matches can be aligned."""
+        found = align_patches(*grays, matches.points_0, matches.points_1)
         good = found.good
         return cls(matches.points_0[good], found.points[good], found.covariance[good])
 
@@ -80,14 +86,13 @@ def corners(image: Tensor, mask: Tensor, spacing: int, most: int = 1500) -> Tens
 
 
 def find_textures(
-    template: Template, image: Tensor, poses: Tensor, view: View, index: int, config: TableConfig
+    template: Template, image: Tensor, view: View, index: int, config: TableConfig
 ) -> ModelPoints | None:
     """Points of coloured objects, found in a view.
 
     Args:
-        template: the objects as they should look, at ``poses`` (N, 4, 4) in this view.
+        template: the objects as they should look in this view.
         image: grey image (H, W) of the view.
-        poses: T_camera_object (N, 4, 4) of the template.
         view: the view.
         index: its number.
         config: standard deviation of surfaces.
@@ -176,12 +181,12 @@ def surface_matches(
 
 
 def find_outlines(
-    template: Template, image: Tensor, view: View, index: int, config: TableConfig, *, reach: int
+    template: Template, image: Tensor, view: View, index: int, config: TableConfig, *, only: Sequence[int], reach: int
 ) -> Outlines | None:
     """Points of the objects' outlines, found in a view within ``reach`` [px].
 
     Along a line across the outline, pixels are like the object's inside up to where they are like what is around it (colour
-    histograms, as in region-based tracking, Prisacariu and Reid 2012). Edges are no help: the nearest strong one is often a
+    histograms, as in region-based tracking, Prisacariu and Reid 2012). Edges only confirm: the nearest strong one is often a
     rim or a label of the object itself.
 
     Args:
@@ -190,19 +195,23 @@ def find_outlines(
         view: the view.
         index: its number.
         config: standard deviation of surfaces.
+        only: which objects.
         reach: how far to look.
     """
     code = (image.long() * HISTOGRAM) // 256
     code = (code[..., 0] * HISTOGRAM + code[..., 1]) * HISTOGRAM + code[..., 2]
+    channels = image.float().unbind(2)
     found = []
-    for k, alone in enumerate(template.outlines):
+    for k in only:
+        alone = template.outlines[k]
         line = None if alone is None else _outline(template, k, alone, reach)
         if line is None:
             continue
         point, pixel, outward = line
         odds = _odds(code, template.owner == k, alone, reach)
         shift, variance = _change(odds, pixel, outward, reach)
-        clear = variance < BLURRED
+        # shadows change colours softly
+        clear = (variance < BLURRED) & (_steepest(channels, pixel, outward, shift) > LEAST_EDGE)
         if int(clear.sum()) < LEAST_OUTLINE:
             continue
         point, pixel, outward, shift, variance = (v[clear] for v in (point, pixel, outward, shift, variance))
@@ -270,9 +279,18 @@ def _change(odds: Tensor, pixel: Tensor, outward: Tensor, reach: int) -> tuple[T
     total = torch.cat([torch.zeros_like(along[:, :1]), along.cumsum(1)], 1)
     shift = torch.cat([step - 0.5, step[-1:] + 0.5])
     near = shift.abs() <= reach
-    share = torch.softmax(TRUST * (2 * total - total[:, -1:])[:, near], 1)
+    score = TRUST * (2 * total - total[:, -1:]) - 0.5 * (shift / (EXPECTED * reach)) ** 2
+    share = torch.softmax(score[:, near], 1)
     mean = share @ shift[near]
     return mean, (share * (shift[near] - mean[:, None]) ** 2).sum(1)
+
+
+def _steepest(channels: Sequence[Tensor], pixel: Tensor, outward: Tensor, shift: Tensor) -> Tensor:
+    """Largest change of a colour over two pixels across the outline, near a shift (M,)."""
+    step = torch.arange(-EDGE, EDGE + 0.25, 0.5, dtype=torch.float64)
+    at = pixel[:, None] + (shift[:, None, None] + step[:, None]) * outward[:, None]
+    change = [sample(c, at + outward[:, None]) - sample(c, at - outward[:, None]) for c in channels]
+    return torch.stack(change).abs().amax(0).amax(1)
 
 
 def _whitening(covariance: Tensor) -> Tensor:

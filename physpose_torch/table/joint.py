@@ -9,8 +9,6 @@ import torch
 from torch import Tensor
 
 from physpose_torch import se3
-from physpose_torch.config import TableConfig
-from physpose_torch.geometry.body import Body
 from physpose_torch.table.adjustment import FINE, ROUGH, Fit, State, Term, adjust
 from physpose_torch.table.alignment import (
     BORDER,
@@ -24,14 +22,14 @@ from physpose_torch.table.alignment import (
     surface_matches,
 )
 from physpose_torch.table.evidence import CommonDepth, Contact, Gravity, NotBelow, PlaneMatches, PosePrior
-from physpose_torch.table.lucas_kanade import align_patches, gray
+from physpose_torch.table.found import Problem
+from physpose_torch.table.lucas_kanade import align_patches, gray, sample
 from physpose_torch.table.roles import Matches
 from physpose_torch.table.standing import plane_hypotheses, standing_on
 from physpose_torch.table.template import Template, eroded, grown, render_template
 from physpose_torch.table.two_view import motion_from_matches, motion_from_objects, triangulate
-from physpose_torch.table.view import View
 
-__all__ = ["Problem", "Solution", "fit_joint", "fit_support"]
+__all__ = ["Solution", "Supported", "fit_joint", "fit_support", "rival_cost"]
 
 logger = logging.getLogger("physpose_torch")
 
@@ -39,43 +37,40 @@ STANDS = 16.0
 """Squared deviation of the feet of an object that stands, in standard deviations of contacts; about three count."""
 FITS = 9.0
 """The same of a match that is where it should be."""
+ENOUGH = 12
+"""Points of an object's texture that were found, from which on its outline is not needed."""
 REACH = (10, 4)
 """[px]; how far from where the poses put them the outlines are looked for, at first and then."""
 SPACING = (6, 4)
 """[px] between points to be matched on the table, and on objects."""
 
 
-class Problem(NamedTuple):
-    """What is given."""
-
-    views: Sequence[View]
-    """One or two."""
-    bodies: Sequence[Body]
-    measured: Sequence[Tensor]
-    """(N, 4, 4) of each view, NaN where unknown [m]."""
-    config: TableConfig
-    gravity: Tensor | None
-    """(3,) unit vector pointing down, view 0."""
-
-    @property
-    def centers(self) -> Tensor:
-        """(N, 3) of the bodies' bounds, object frame [m]."""
-        return torch.stack([b.center for b in self.bodies]) if self.bodies else torch.zeros(0, 3, dtype=torch.float64)
-
-
 class Solution(NamedTuple):
     """What was found."""
 
-    fit: Fit
-    standing: Tensor
-    """(N,) bool: objects that stand on the table."""
+    fit: "Supported"
     table: Matches | None
     """Matches on the table."""
     rival: float
     """By how much the next best, different plane explains everything worse (difference of costs); infinite: there is none."""
+    disagreement: float
+    """Squared deviation of the typical object's estimated pose, in standard deviations; 6 is the mean."""
+    two: bool
+    """Whether the second view had a say."""
 
 
-def fit_support(problem: Problem, motion: Tensor | None = None) -> list[Fit]:
+class Supported(NamedTuple):
+    """A fit, and which objects stand on its plane."""
+
+    state: State
+    covariance: Tensor
+    """(3, 3) see :class:`~physpose_torch.table.adjustment.Fit`."""
+    cost: float
+    standing: Tensor
+    """(N,) bool."""
+
+
+def fit_support(problem: Problem, motion: Tensor | None = None) -> list[Supported]:
     """Planes by the poses alone, the likeliest first: stable faces, bottoms, priors, gravity.
 
     Args:
@@ -94,11 +89,12 @@ def fit_support(problem: Problem, motion: Tensor | None = None) -> list[Fit]:
         state = State(eye if motion is None else motion, filled, guess.normal, guess.offset, one, middle)
         for schedule in (ROUGH, FINE):
             state = adjust(state, _pose_terms(problem, state, two=motion is not None), schedule).state
-        fits.append(adjust(state, _pose_terms(problem, state, two=motion is not None), ()))
+        terms = _pose_terms(problem, state, two=motion is not None)
+        fits.append(_supported(problem, adjust(state, terms, ()), terms))
     return sorted(fits, key=lambda fit: fit.cost)
 
 
-def fit_joint(problem: Problem, find_matches: Callable[[Tensor, Tensor], Matches]) -> Solution | None:
+def fit_joint(problem: Problem, find_matches: Callable[[Tensor, Tensor], Matches | None]) -> Solution | None:
     """The plane by all there is; None where not even the poses tell of one.
 
     Args:
@@ -110,7 +106,8 @@ def fit_joint(problem: Problem, find_matches: Callable[[Tensor, Tensor], Matches
     matches = None
     grays = [None if v.image is None else gray(v.image) for v in views]
     if len(views) == 2 and all(g is not None for g in grays):
-        matches = Located.of(find_matches(views[0].image, views[1].image), grays)
+        rough = find_matches(views[0].image, views[1].image)
+        matches = None if rough is None else Located.of(rough, grays)
     motions = _motions(problem, motion, matches)
     supported = fit_support(problem, motions[0] if motions else None)
     if not supported:
@@ -127,14 +124,19 @@ def fit_joint(problem: Problem, find_matches: Callable[[Tensor, Tensor], Matches
         start = start._replace(T_view1_view0=motion if motion is not None else fits[0].state.T_view1_view0)
         fit, _ = _fit_all(problem, start, evidence, matches if two else None, two, ROUGH)
         fits = sorted([*fits, fit], key=lambda fit: fit.cost)
-    rival = min((f.cost for f in fits[1:] if _differ(f.state, fits[0].state)), default=math.inf) - fits[0].cost
+    rival = rival_cost(fits)
 
     state = fits[0].state
     evidence = _aligned(problem, state, grays, REACH[1], two)
     if matches is not None and two:
         matches = _denser(problem, state, grays, matches)
     fit, terms = _fit_all(problem, state, evidence, matches if two else None, two, FINE)
-    return _solution(problem, fit, terms, rival)
+    return _solution(problem, fit, terms, rival, two)
+
+
+def rival_cost(fits: Sequence[Fit | Supported]) -> float:
+    """By how much the best of the others that is another plane is worse than the first; infinite if there is none."""
+    return min((f.cost for f in fits[1:] if _differ(f.state, fits[0].state)), default=math.inf) - fits[0].cost
 
 
 def _base_poses(problem: Problem, motion: Tensor | None) -> Tensor:
@@ -177,12 +179,17 @@ def _aligned(problem: Problem, state: State, grays: Sequence[Tensor | None], rea
     templates = _templates(problem, state, two)
     terms: list[Term] = []
     if problem.config.align:
-        poses = [state.poses, state.T_view1_view0 @ state.poses]
         for k, (view, template) in enumerate(zip(problem.views, templates, strict=False)):
             if grays[k] is None:
                 continue
-            terms.append(find_outlines(template, view.image, view, k, problem.config, reach=reach))
-            terms.append(find_textures(template, grays[k], poses[k], view, k, problem.config))
+            textures = find_textures(template, grays[k], view, k, problem.config)
+            terms.append(textures)
+            # colours say where an object is better than its outline, which has shadows beside it
+            count = torch.zeros(len(problem.bodies)) if textures is None else torch.bincount(
+                textures.owner, minlength=len(problem.bodies)
+            )
+            rest = (count < ENOUGH).nonzero()[:, 0].tolist()
+            terms.append(find_outlines(template, view.image, view, k, problem.config, only=rest, reach=reach))
     return templates, [t for t in terms if t is not None]
 
 
@@ -242,7 +249,11 @@ def _motions(problem: Problem, by_objects: Tensor | None, matches: Located | Non
 
 
 def _denser(problem: Problem, state: State, grays: Sequence[Tensor], matches: Located) -> Located:
-    """Matches all over the table and the objects, found from where the state says they are."""
+    """Matches all over the table and the objects, found from where the state says they are.
+
+    View 1 is warped into view 0 by the surfaces, and what is left of shifts is looked for: patches of curved surfaces map by
+    no affine map, and would all be off to the same side.
+    """
     K0, K1 = (v.K for v in problem.views)
     template = _templates(problem, state, two=False)[0]
     on = template.owner >= 0
@@ -250,11 +261,23 @@ def _denser(problem: Problem, state: State, grays: Sequence[Tensor], matches: Lo
     for k in range(len(problem.bodies)):
         inner |= eroded(template.owner == k, BORDER)
     points = torch.cat([corners(grays[0], ~grown(on, CLEAR), SPACING[0]), corners(grays[0], inner, SPACING[1])])
+    warp, _ = predict_matches(state, template, K0, K1, _all_pixels(on.shape))
+    warped = sample(grays[1], warp.nan_to_num(-1.0).reshape(*on.shape, 2), "bicubic")
+    found = align_patches(grays[0], warped, points, points, deform=False)
     where, affine = predict_matches(state, template, K0, K1, points)
-    inside = ((where > 0) & (where < where.new_tensor(list(grays[1].shape[::-1])) - 1)).all(1)
-    guess = Matches(points[inside], where[inside], torch.ones(int(inside.sum())))
-    found = Located.of(guess, grays, affine[inside])
-    return Located(*(torch.cat(pair) for pair in zip(found, matches, strict=True)))
+    where = where + (affine @ (found.points - points)[..., None])[..., 0]
+    covariance = affine @ found.covariance @ affine.mT
+    inside = ((where > 0) & (where < where.new_tensor(list(grays[1].shape[::-1])) - 1)).all(1) & found.good
+    # rough matches still tell of what is neither table nor object
+    x, y = matches.points_0.round().long().unbind(1)
+    off = ~grown(on, CLEAR)[y.clamp(0, on.shape[0] - 1), x.clamp(0, on.shape[1] - 1)]
+    dense = Located(points[inside], where[inside], covariance[inside])
+    return Located(*(torch.cat([new, old[off]]) for new, old in zip(dense, matches, strict=True)))
+
+
+def _all_pixels(size: tuple[int, int]) -> Tensor:
+    y, x = torch.meshgrid(torch.arange(size[0]), torch.arange(size[1]), indexing="ij")
+    return torch.stack([x, y], -1).reshape(-1, 2).double()
 
 
 def _differ(first: State, second: State) -> bool:
@@ -264,15 +287,23 @@ def _differ(first: State, second: State) -> bool:
     return float(tilt) > math.radians(5.0) or abs(float(height)) > 0.02
 
 
-def _solution(problem: Problem, fit: Fit, terms: Sequence[Term], rival: float) -> Solution:
+def _supported(problem: Problem, fit: Fit, terms: Sequence[Term]) -> Supported:
     standing = torch.zeros(len(problem.bodies), dtype=torch.bool)
-    table = None
     for term, squared in zip(terms, fit.surprise, strict=True):
         if isinstance(term, Contact):
             standing[term.owner] = squared < STANDS
+    return Supported(fit.state, fit.covariance, fit.cost, standing)
+
+
+def _solution(problem: Problem, fit: Fit, terms: Sequence[Term], rival: float, two: bool) -> Solution:
+    table, priors = None, []
+    for term, squared in zip(terms, fit.surprise, strict=True):
+        if isinstance(term, PosePrior):
+            priors.append(squared)
         if isinstance(term, PlaneMatches):
             across, along = squared.reshape(2, -1)
             on = (across < FITS) & (along < FITS) & (term.weight[len(across) :] > 0)
             points_0 = term.rays[on] @ problem.views[0].K.mT
             table = Matches(points_0[:, :2], term.points_1[on], torch.ones(int(on.sum())))
-    return Solution(fit, standing, table, rival)
+    disagreement = float(torch.cat(priors).median()) if priors else 0.0
+    return Solution(_supported(problem, fit, terms), table, rival, disagreement, two)

@@ -78,7 +78,6 @@ def _surface(body: Body) -> _Surface:
 
 def render_template(bodies: Sequence[Body], poses: Tensor, K: Tensor, size: tuple[int, int]) -> Template:
     """Draw objects at poses (N, 4, 4) T_camera_object [m] into an image of (height, width); NaN poses are not drawn."""
-    height, width = size
     owner = torch.full(size, -1)
     depth = torch.full(size, torch.inf, dtype=torch.float64)
     point, normal = (torch.zeros(*size, 3, dtype=torch.float64) for _ in range(2))

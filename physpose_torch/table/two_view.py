@@ -6,11 +6,12 @@ import torch
 from torch import Tensor
 
 from physpose_torch import se3
+from physpose_torch.distance.smoothing import tangent_basis
 from physpose_torch.table.ransac import RansacInfo
 from physpose_torch.table.roles import Matches
 from physpose_torch.table.view import pixel_rays, project
 
-__all__ = ["motion_from_matches", "motion_from_objects", "triangulate"]
+__all__ = ["motion_from_matches", "motion_from_objects", "refine_motion", "triangulate"]
 
 EPIPOLAR = 1.5
 """[px]; a match farther than this from its epipolar line is wrong."""
@@ -70,6 +71,47 @@ def motion_from_matches(
     points, residual = triangulate(T, K0, K1, matches.points_0, matches.points_1)
     good = torch.from_numpy(mask[:, 0] > 0) & (residual < 2 * EPIPOLAR) & (points[:, 2] > 0)
     return T, RansacInfo(good, residual, 5000)
+
+
+def refine_motion(
+    T_view1_view0: Tensor, K0: Tensor, K1: Tensor, points_0: Tensor, points_1: Tensor, covariance: Tensor
+) -> tuple[Tensor, Tensor]:
+    """A motion with a baseline of length 1, fitted to matches (M, 2), (M, 2) by their distances from epipolar lines.
+
+    Five points know a motion roughly; all of them, each as well as it is located, know it much better.
+
+    Args:
+        T_view1_view0: to start from; its translation's length does not matter.
+        K0, K1: intrinsics.
+        points_0, points_1: matches [px].
+        covariance: (M, 2, 2) of the second points [px²].
+
+    Returns:
+        The motion, and the distances (M,) in standard deviations.
+    """
+    rays = pixel_rays(K0, points_0)
+    ahead = pixel_rays(K1, points_1)
+    to_pixels = torch.linalg.inv(K1).mT[:2]
+    T = T_view1_view0.clone()
+    T[:3, 3] /= torch.linalg.vector_norm(T[:3, 3]).clamp_min(1e-12)
+
+    def distance(step: Tensor) -> Tensor:
+        R = T[:3, :3] @ (torch.eye(3, dtype=T.dtype) + se3.hat(step[:3]))
+        t = T[:3, 3] + step[3:] @ tangent_basis(T[None, :3, 3])[0]
+        line = torch.linalg.cross(t.expand_as(rays), rays @ R.mT)
+        slope = line @ to_pixels.mT
+        variance = (slope[:, None] @ covariance @ slope[..., None])[:, 0, 0]
+        return (ahead * line).sum(1) / variance.clamp_min(1e-30).sqrt()
+
+    zero = T.new_zeros(5)
+    for scale in (8.0, 4.0, 2.0, 1.0, 1.0, 1.0):
+        r, J = distance(zero), torch.func.jacfwd(distance)(zero)
+        weight = 5.0 / (4.0 + (r / scale) ** 2)
+        normal = J.mT @ (weight[:, None] * J) + 1e-6 * torch.eye(5, dtype=T.dtype)
+        step = -torch.linalg.solve(normal, J.mT @ (weight * r)).clamp(-0.1, 0.1)
+        shift = T[:3, 3] + step[3:] @ tangent_basis(T[None, :3, 3])[0]
+        T = se3.from_rotation_translation(T[:3, :3] @ se3.exp_so3(step[:3]), shift / torch.linalg.vector_norm(shift))
+    return T, distance(zero)
 
 
 def triangulate(T_view1_view0: Tensor, K0: Tensor, K1: Tensor, points_0: Tensor, points_1: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,445 @@
+"""The estimated table, drawn into the image it was estimated from: one sees at once whether it lies where the table is.
+
+Everything is computed from the camera model and `render_template`: no GL and no display. matplotlib (text) and pillow are
+imported on use.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from scipy.ndimage import gaussian_filter
+from scipy.special import ndtri
+from torch import Tensor
+
+from physpose_torch import se3
+from physpose_torch.errors import InvalidInputError
+from physpose_torch.geometry.body import Body, Plane
+from physpose_torch.table.template import Template, render_template
+from physpose_torch.table.view import SMALLEST, View, pixel_rays, project
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+__all__ = ["Grid", "GridLines", "grid_lines", "table_grid", "table_picture"]
+
+NEAR = 0.05
+"""Lines are clipped where they come nearer to the camera than this [m]."""
+CELLS = ((0.40, 0.02), (1.25, 0.05), (torch.inf, 0.10))
+"""Cells [m] for objects that together are less than so wide [m]: 8 to 25 cells across, fewer for a single small object."""
+MARGIN = 6
+"""The grid goes on for so many cells around the objects, and fades out on them."""
+FINEST = (3.0, 8.0)
+"""Where a cell is less high than this in the image [px], the lines are invisible; where it is more than that, clear."""
+BRIGHT = 0.60
+"""Lines are dark where the table is brighter than this on average (0 to 1), white elsewhere."""
+TOUCHES = 0.006
+"""A contact that lies deeper than this behind the surface seen there [m] is hidden."""
+
+_SUPER, _SHIFT = 4, 4  # samples per pixel and direction; fractional bits of their coordinates
+_STANDING, _OTHER, _CONTACT = "#12c4b4", "#ff8a1f", "#ffd83d"
+_LIGHT, _DARK, _INK, _PAPER, _FILL = "#ffffff", "#0b2545", "#33332f", "#f7f6f3", "#dddbd5"
+
+
+class Grid(NamedTuple):
+    """Squares on a plane, around what stands there."""
+
+    T_camera_grid: Tensor
+    """(4, 4) [m]: origin on the plane, under the middle of the objects; z is the normal, x the camera's right."""
+    cell: float
+    """Side of a square [m]; lines are at its multiples."""
+    low: Tensor
+    """(2,) least x and y of what the objects cover [m]."""
+    high: Tensor
+    """(2,) greatest x and y [m]."""
+
+
+class GridLines(NamedTuple):
+    """The part of a grid that is in front of a camera and in its image."""
+
+    segments: Tensor
+    """(L, 2, 3) ends in the camera frame [m]."""
+    strong: Tensor
+    """(L,) bool: every other line."""
+
+
+def table_grid(plane: Plane, points: Tensor, K: Tensor, size: tuple[int, int]) -> Grid | None:
+    """The grid for objects with surface points (P, 3) in the camera frame [m]; around what is at the image's centre if P is 0.
+
+    Args:
+        plane: the table.
+        points: of the objects.
+        K: (3, 3) [px].
+        size: height and width of the image [px].
+
+    Returns:
+        The grid; None where there are no objects and the plane is out of sight.
+    """
+    normal, offset = plane.normal.detach().cpu().double(), plane.offset.detach().cpu().double()
+    axis = torch.eye(3, dtype=torch.float64)[0 if abs(float(normal[0])) < 0.9 else 1]
+    x = torch.nn.functional.normalize(axis - (axis @ normal) * normal, dim=0)
+    R = torch.stack([x, torch.linalg.cross(normal, x), normal], 1)
+    if len(points):
+        flat = points @ R[:, :2]
+        low, high = flat.amin(0), flat.amax(0)
+        middle = (low + high) / 2
+    else:
+        depth = _plane_depth(plane, K, size)
+        # a grazing view sees the table below the centre, and near the horizon it sees nothing of a grid
+        near = depth <= max(6 * abs(float(offset)), 1.001 * float(depth.min()))
+        if not bool((near & depth.isfinite()).any()):
+            return None
+        rows, columns = near.nonzero().unbind(1)
+        best = ((rows - (size[0] - 1) / 2) ** 2 + (columns - (size[1] - 1) / 2) ** 2).argmin()
+        z = depth[rows[best], columns[best]]
+        middle = (z * pixel_rays(K, torch.stack([columns[best], rows[best]]).double())) @ R[:, :2]
+        half = (z * size[1] / K[0, 0] / 4).clamp(0.1, 1.0).expand(2)
+        low, high = middle - half, middle + half
+    cell = next(c for limit, c in CELLS if float((high - low).max()) < limit)
+    origin = R[:, :2] @ middle + offset * normal
+    return Grid(se3.from_rotation_translation(R, origin), cell, low - middle, high - middle)
+
+
+def grid_lines(grid: Grid, K: Tensor, size: tuple[int, int]) -> GridLines:
+    """The lines of a grid that a camera K (3, 3) sees in an image of (height, width), clipped at its border."""
+    first = (grid.low / grid.cell).floor().long() - MARGIN
+    last = (grid.high / grid.cell).ceil().long() + MARGIN
+    ends, strong = [], []
+    for axis in range(2):
+        at = torch.arange(int(first[axis]), int(last[axis]) + 1)
+        line = torch.zeros(len(at), 2, 3, dtype=torch.float64)
+        line[:, :, axis] = grid.cell * at[:, None].double()
+        line[:, :, 1 - axis] = grid.cell * torch.stack([first[1 - axis], last[1 - axis]]).double()
+        ends.append(line)
+        strong.append(at % 2 == 0)
+    segments, kept = _clipped(se3.apply(grid.T_camera_grid, torch.cat(ends).view(-1, 3)).view(-1, 2, 3), K, size)
+    return GridLines(segments, torch.cat(strong)[kept])
+
+
+def table_picture(
+    image: Tensor | np.ndarray | None,
+    K: Tensor,
+    plane: Plane,
+    *,
+    bodies: Sequence[Body] = (),
+    poses: Tensor | None = None,
+    standing: Tensor | None = None,
+    contacts: Tensor | None = None,
+    title: str | None = None,
+    caption: str | None = None,
+    size: tuple[int, int] | None = None,
+    path: str | Path | None = None,
+) -> "Image":
+    """Draw a table as a metric grid into the image, with the objects' outlines and the points where they touch it.
+
+    The grid is centred under the objects, fades out around them, and is hidden by what is in front of it; it covers what
+    is under the table. Outlines are blue-green; orange where the object does not stand on the table. Contacts are dots;
+    rings where an object hides them. An arrow shows the normal. Same arguments, same picture.
+
+    Args:
+        image: (H, W, 3) uint8, RGB; None: a plain background with the objects' shapes.
+        K: (3, 3) intrinsics [px], pixel centres at integers.
+        plane: the table, camera frame [m].
+        bodies: N objects.
+        poses: T_camera_object (N, 4, 4) [m]; a row of NaN is not drawn.
+        standing: (N,) bool: which objects stand on the table; None: no distinction.
+        contacts: (C, 3) where objects touch the table, camera frame [m].
+        title: over the image.
+        caption: under the image.
+        size: height and width [px] where there is no image; None: twice the principal point.
+        path: also write the picture there (.png).
+
+    Returns:
+        The picture, RGB, as large as the image, and higher where there is a title or caption.
+
+    Raises:
+        InvalidInputError: shapes or lengths do not fit together, or poses are not rigid.
+    """
+    view = View(image, K, poses)
+    size = _checked_size(size, view)
+    standing, contacts = _check(plane, bodies, view, standing, contacts)
+    K, poses = view.K, view.measured
+    if poses is None:
+        poses = torch.zeros(0, 4, 4, dtype=torch.float64)
+    seen = render_template(bodies, poses, K, size)
+    surfaces = [
+        se3.apply(T, torch.tensor(np.asarray(body.mesh.vertices)))
+        for body, T, outline in zip(bodies, poses, seen.outlines, strict=True)
+        if outline is not None
+    ]
+    grid = table_grid(plane, torch.cat(surfaces) if surfaces else torch.zeros(0, 3, dtype=torch.float64), K, size)
+
+    if view.image is None:
+        canvas = np.where((seen.owner >= 0).numpy()[..., None], _rgb(_FILL), _rgb(_PAPER))
+    else:
+        canvas = view.image.numpy() / 255.0
+    unit = max(min(size) / 480, 0.5)  # of line widths [px]
+    if grid is not None:
+        shown = _shown(grid, plane, K, seen)
+        canvas = _lay_grid(canvas, grid, K, shown, unit)
+    order = sorted(range(len(bodies)), key=lambda k: standing is not None and not bool(standing[k]))
+    for k in order:  # those that do not stand come last, for theirs are the outlines to be noticed
+        color = _STANDING if standing is None or bool(standing[k]) else _OTHER
+        canvas = _outline(canvas, (seen.owner == k).numpy(), color, unit)
+    if grid is not None:
+        canvas = _arrow(canvas, grid, K, shown, unit)
+    canvas = _dots(canvas, contacts, K, seen, unit)
+
+    legend = [] if grid is None else [(None, f"{100 * grid.cell:.0f} cm grid")]
+    drawn = [k for k, outline in enumerate(seen.outlines) if outline is not None]
+    if standing is not None and drawn:
+        colors = {True: (_STANDING, "on the table"), False: (_OTHER, "not on it")}
+        legend += [colors[value] for value in (True, False) if any(bool(standing[k]) == value for k in drawn)]
+    picture = _compose(np.round(canvas * 255).astype(np.uint8), legend, title, caption, unit)
+    if path is not None:
+        picture.save(path, optimize=True)
+    return picture
+
+
+def _checked_size(size: tuple[int, int] | None, view: View) -> tuple[int, int]:
+    if size is None:
+        size = view.size
+    elif view.image is not None and tuple(size) != view.size:
+        raise InvalidInputError(
+            f"size = {tuple(size)}, but the image is {view.size}; leave size out, it is for image=None"
+        )
+    if len(size) != 2 or min(size) < SMALLEST:
+        raise InvalidInputError(f"size = {tuple(size)}, expected (height, width) of at least {SMALLEST} px")
+    return int(size[0]), int(size[1])
+
+
+def _check(
+    plane: Plane, bodies: Sequence[Body], view: View, standing: Tensor | None, contacts: Tensor | None
+) -> tuple[Tensor | None, Tensor]:
+    n = len(bodies)
+    if not isinstance(plane, Plane):
+        raise InvalidInputError(f"plane is a {type(plane).__name__}, expected a Plane in the camera frame [m]")
+    shape = None if view.poses is None else tuple(view.poses.shape)
+    if shape != (n, 4, 4) and (n or shape):
+        given = "is None" if shape is None else f"has shape {shape}"
+        raise InvalidInputError(f"poses {given}, expected T_camera_object ({n}, 4, 4) for {n} bodies")
+    if standing is not None:
+        standing = torch.as_tensor(standing).detach().cpu()
+        if standing.shape != (n,) or standing.dtype != torch.bool:
+            raise InvalidInputError(
+                f"standing is {standing.dtype} of shape {tuple(standing.shape)}, expected torch.bool ({n},), one an object"
+            )
+    if contacts is None:
+        return standing, torch.zeros(0, 3, dtype=torch.float64)
+    contacts = torch.as_tensor(contacts).detach().to("cpu", torch.float64)
+    if contacts.ndim != 2 or contacts.shape[1] != 3 or not bool(contacts.isfinite().all()):
+        raise InvalidInputError(
+            f"contacts has shape {tuple(contacts.shape)}, expected finite points (C, 3) in the camera frame [m]"
+        )
+    return standing, contacts
+
+
+def _plane_depth(plane: Plane, K: Tensor, size: tuple[int, int]) -> Tensor:
+    """(H, W) z of the plane at every pixel [m]; infinite above the horizon and where it is too near."""
+    y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in size), indexing="ij")
+    slope = pixel_rays(K, torch.stack([x, y], -1)) @ plane.normal.detach().cpu().double()
+    depth = plane.offset.detach().cpu().double() / slope
+    return torch.where(depth.isfinite() & (depth > NEAR), depth, torch.inf)
+
+
+def _clipped(segments: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Segments (L, 2, 3) cut off at `NEAR` and a few pixels outside the image, and which (M,) of them are left."""
+    height, width = size
+    x, y, z = K  # a pixel times its depth
+    a, b = segments.unbind(1)
+    start, end = torch.zeros(len(a), dtype=torch.float64), torch.ones(len(a), dtype=torch.float64)
+    for side, least in ((z, NEAR), (x + 8 * z, 0), ((width + 8) * z - x, 0), (y + 8 * z, 0), ((height + 8) * z - y, 0)):
+        at, rise = a @ side - least, (b - a) @ side
+        cut = -at / torch.where(rise == 0, 1.0, rise)
+        start = torch.where(rise > 0, torch.maximum(start, cut), start)
+        end = torch.where(rise < 0, torch.minimum(end, cut), end)
+        end = torch.where((rise == 0) & (at < 0), -1.0, end)
+    kept = (end > start).nonzero()[:, 0]
+    a, b, start, end = a[kept], b[kept], start[kept, None], end[kept, None]
+    return torch.stack([a + start * (b - a), a + end * (b - a)], 1), kept
+
+
+def _rgb(color: str) -> np.ndarray:
+    return np.array([int(color[k : k + 2], 16) for k in (1, 3, 5)]) / 255
+
+
+def _mix(canvas: np.ndarray, color: str, alpha: np.ndarray) -> np.ndarray:
+    return canvas + alpha[..., None] * (_rgb(color) - canvas)
+
+
+def _ink(size: tuple[int, int], draw: Callable[[np.ndarray], object]) -> np.ndarray:
+    """What share (H, W) of every pixel is covered by what `draw` sets to 255 in an image of `_SUPER`² samples a pixel."""
+    fine = np.zeros((size[0] * _SUPER, size[1] * _SUPER), np.uint8)
+    draw(fine)
+    return cv2.resize(fine, (size[1], size[0]), interpolation=cv2.INTER_AREA) / 255.0
+
+
+def _fixed(pixels: Tensor) -> np.ndarray:
+    """Where pixels (..., 2) are in that image, as OpenCV wants it."""
+    return (((pixels + 0.5) * _SUPER - 0.5) * (1 << _SHIFT)).round().numpy().astype(np.int64)
+
+
+def _lines(size: tuple[int, int], ends: Tensor, width: float) -> np.ndarray:
+    """Cover (H, W) of lines between pixels (L, 2, 2)."""
+
+    def draw(fine: np.ndarray) -> None:
+        for a, b in _fixed(ends).tolist():
+            cv2.line(fine, a, b, 255, max(round(width * _SUPER), 1), cv2.LINE_8, _SHIFT)
+
+    return _ink(size, draw)
+
+
+def _discs(size: tuple[int, int], centres: Tensor, radius: float) -> np.ndarray:
+    """Cover (H, W) of discs around pixels (M, 2)."""
+
+    def draw(fine: np.ndarray) -> None:
+        for at in _fixed(centres).tolist():
+            cv2.circle(fine, at, round(radius * _SUPER * (1 << _SHIFT)), 255, -1, cv2.LINE_8, _SHIFT)
+
+    return _ink(size, draw)
+
+
+def _shown(grid: Grid, plane: Plane, K: Tensor, seen: Template) -> np.ndarray:
+    """(H, W) from 1 at the objects to 0 where the grid ends, is too fine to be seen, or is behind an object."""
+    depth = _plane_depth(plane, K, tuple(seen.owner.shape))
+    hit = depth.isfinite()
+    y, x = hit.nonzero().unbind(1)
+    z = depth[hit]
+    points = z[:, None] * pixel_rays(K, torch.stack([x, y], -1).double())
+    spots = se3.apply(se3.inverse(grid.T_camera_grid), points)[:, :2]
+    beside = torch.maximum(grid.low - spots, spots - grid.high).clamp_min(0).norm(dim=1) / (MARGIN * grid.cell)
+    pixels = grid.cell * K[1, 1] * plane.offset.detach().cpu().double().abs() / z**2  # height of a cell
+    clear = (1 - beside).clamp(0, 1) * ((pixels - FINEST[0]) / (FINEST[1] - FINEST[0])).clamp(0, 1)
+    out = torch.zeros_like(depth)
+    out[hit] = clear * clear * (3 - 2 * clear)
+    covered = (seen.owner >= 0) & (seen.depth < depth)
+    return out.numpy() * (1 - gaussian_filter(covered.double().numpy(), 0.5))
+
+
+def _lay_grid(canvas: np.ndarray, grid: Grid, K: Tensor, shown: np.ndarray, unit: float) -> np.ndarray:
+    """The lines over an image (H, W, 3)."""
+    size = canvas.shape[:2]
+    lines = grid_lines(grid, K, size)
+    ends = project(K, lines.segments)
+    weak, strong = (_lines(size, ends[lines.strong == s], (1.0 + 0.5 * s) * unit) for s in (0, 1))
+    halo = _lines(size, ends[lines.strong], 3.5 * unit)
+    grey, weight = canvas.mean(2), shown / max(shown.sum(), 1e-9)
+    brightness = float((grey * weight).sum())
+    contrast = float(((grey - brightness) ** 2 * weight).sum()) ** 0.5  # a chequered table has both dark and bright
+    line, other = (_DARK, _LIGHT) if brightness > BRIGHT else (_LIGHT, _DARK)
+    canvas = _mix(canvas, other, 0.08 * shown)
+    canvas = _mix(canvas, other, min(0.2 + contrast, 0.6) * halo * shown)
+    return _mix(canvas, line, np.maximum(0.5 * weak, 0.9 * strong) * shown)
+
+
+def _outline(canvas: np.ndarray, mask: np.ndarray, color: str, unit: float) -> np.ndarray:
+    """The border of a mask (H, W) as a line, half of it inside."""
+    mask = cv2.medianBlur(mask.astype(np.uint8), 3)  # scans have pinholes
+    sigma = max(unit, 1.0)
+    blurred = gaussian_filter(mask.astype(float), sigma, mode="nearest")
+    distance = sigma * np.abs(ndtri(blurred.clip(1e-9, 1 - 1e-9)))  # of a straight border, exactly [px]
+    canvas = _mix(canvas, _DARK, 0.35 * (0.5 + 1.5 * unit - distance).clip(0, 1))
+    return _mix(canvas, color, (0.5 + 0.8 * unit - distance).clip(0, 1))
+
+
+def _arrow(canvas: np.ndarray, grid: Grid, K: Tensor, shown: np.ndarray, unit: float) -> np.ndarray:
+    """The normal, at the crossing of lines nearest to the middle at which it can be seen."""
+    size = canvas.shape[:2]
+    length = float((0.2 * (grid.high - grid.low).max()).clamp(0.04, 0.15))
+    first, last = (grid.low / grid.cell).ceil().long() - 2, (grid.high / grid.cell).floor().long() + 2
+    nodes = torch.cartesian_prod(*(torch.arange(int(a), int(b) + 1) for a, b in zip(first, last, strict=True)))
+    nodes = nodes[(nodes**2).sum(1).sort(stable=True).indices].double() * grid.cell
+    foot = torch.cat([nodes, torch.zeros_like(nodes[:, :1])], 1)
+    foot, tip = (se3.apply(grid.T_camera_grid, foot + foot.new_tensor([0, 0, h])) for h in (0.0, length))
+    ahead = torch.minimum(foot[:, 2], tip[:, 2]) > NEAR
+    foot, tip = project(K, foot[ahead]), project(K, tip[ahead])
+    limit = foot.new_tensor([size[1], size[0]]) - 1
+    inside = ((foot > 4) & (tip > 4) & (foot < limit - 4) & (tip < limit - 4)).all(1)
+    foot, tip = foot[inside], tip[inside]
+    column, row = foot.round().long().unbind(1)
+    found = (torch.from_numpy(shown)[row, column] > 0.3).nonzero()[:, 0]
+    if not len(found):
+        return canvas
+    foot, tip = foot[found[0]], tip[found[0]]
+    along = tip - foot
+    reach = float(along.norm())
+    if reach < 4 * unit:  # seen from above: it comes towards the camera
+        canvas = _mix(canvas, _DARK, _discs(size, foot[None], 4.5 * unit))
+        return _mix(canvas, _LIGHT, _discs(size, foot[None], 3 * unit))
+    along = along / reach
+    across = along.flip(0) * along.new_tensor([-1.0, 1.0])
+    head = min(9 * unit, 0.6 * reach)
+    for color, grow in ((_DARK, 1.4 * unit), (_LIGHT, 0.0)):
+        back, side = tip - (head + grow) * along, (0.42 * head + 1.3 * grow) * across
+        corners = _fixed(torch.stack([tip + 1.8 * grow * along, back + side, back - side])).astype(np.int32)
+        shaft = torch.stack([foot, tip - 0.8 * head * along])[None]
+        cover = _ink(size, lambda fine, c=corners: cv2.fillPoly(fine, [c], 255, cv2.LINE_8, _SHIFT))
+        cover = np.maximum(cover, _lines(size, shaft, 2.2 * unit + 2 * grow))
+        canvas = _mix(canvas, color, np.maximum(cover, _discs(size, foot[None], 2.6 * unit + grow)))
+    return canvas
+
+
+def _dots(canvas: np.ndarray, contacts: Tensor, K: Tensor, seen: Template, unit: float) -> np.ndarray:
+    """Contacts (C, 3) as dots, or rings where an object hides them."""
+    size = canvas.shape[:2]
+    contacts = contacts[contacts[:, 2] > NEAR]
+    pixels = project(K, contacts)
+    inside = ((pixels > -0.5) & (pixels < pixels.new_tensor([size[1], size[0]]) - 0.5)).all(1)
+    contacts, pixels = contacts[inside], pixels[inside]
+    column, row = pixels.round().long().unbind(1)
+    hidden = (seen.owner[row, column] >= 0) & (seen.depth[row, column] < contacts[:, 2] - TOUCHES)
+    outer, ring, hole, core = (_discs(size, pixels[hidden], r * unit) for r in (4.0, 3.3, 2.0, 1.4))
+    canvas = _mix(canvas, _DARK, 0.45 * (outer - core))
+    canvas = _mix(canvas, _CONTACT, 0.7 * (ring - hole))
+    outer, inner = (_discs(size, pixels[~hidden], r * unit) for r in (4.0, 2.8))
+    return _mix(_mix(canvas, _DARK, outer), _CONTACT, inner)
+
+
+def _compose(
+    canvas: np.ndarray, legend: list[tuple[str | None, str]], title: str | None, caption: str | None, unit: float
+) -> "Image":
+    """The image (H, W, 3) uint8 with a legend, between a title and a caption."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Rectangle
+    from PIL import Image
+
+    height, width = canvas.shape[:2]
+    head, foot = (round(46 * unit) if title else 0), (round(44 * unit) if caption else 0)
+    total = head + height + foot
+    sheet = np.full((total, width, 3), 255, np.uint8)
+    sheet[head : head + height] = canvas
+    figure = Figure(figsize=(width / 100, total / 100), dpi=100, facecolor="white")
+    agg = FigureCanvasAgg(figure)
+    figure.figimage(sheet, 0, 0, origin="upper", zorder=-1)
+
+    def text(x: float, y: float, value: str, size: float, **style: object) -> float:
+        """Write, no wider than the picture; returns the width [px]."""
+        written = figure.text(x / width, 1 - y / total, value, size=size * unit, va="center", color=_INK, **style)
+        extent = written.get_window_extent(agg.get_renderer()).width
+        if extent > 0.96 * width:
+            written.set_size(size * unit * 0.96 * width / extent)
+        return extent
+
+    def box(x: float, y: float, w: float, h: float, **style: object) -> None:
+        corner = (x / width, 1 - (y + h) / total)
+        figure.add_artist(Rectangle(corner, w / width, h / total, transform=figure.transFigure, linewidth=0, **style))
+
+    if title:
+        text(width / 2, head / 2, title, 15, ha="center", weight="bold")
+    if caption:
+        text(width / 2, total - foot / 2, caption, 12.5, ha="center")
+    if legend:
+        margin, top, bottom = 8 * unit, head + height - 28 * unit, head + height - 8 * unit
+        x, middle = margin + 7 * unit, (top + bottom) / 2
+        for color, label in legend:
+            if color is not None:
+                box(x, middle - 1.5 * unit, 14 * unit, 3 * unit, facecolor=color, zorder=2)
+                x += 19 * unit
+            x += text(x, middle, label, 9, ha="left", zorder=3) + 12 * unit
+        box(margin, top, x - 5 * unit - margin, bottom - top, facecolor="white", alpha=0.8, zorder=1)
+    agg.draw()
+    return Image.fromarray(np.asarray(agg.buffer_rgba())[..., :3].copy())
