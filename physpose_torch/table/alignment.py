@@ -15,7 +15,15 @@ from torch.nn.functional import avg_pool3d, pad
 
 from physpose_torch.config import TableConfig
 from physpose_torch.table.adjustment import State
-from physpose_torch.table.evidence import ModelPoints, Outlines, PlaneMatches, SurfaceMatches, few
+from physpose_torch.table.evidence import (
+    EpipolarMatches,
+    ModelPoints,
+    Outlines,
+    PlaneMatches,
+    SurfaceMatches,
+    few,
+    plane_terms,
+)
 from physpose_torch.table.lucas_kanade import align_patches, gray, sample
 from physpose_torch.table.roles import Matches
 from physpose_torch.table.template import Template, eroded, grown
@@ -143,15 +151,13 @@ def predict_matches(state: State, template: Template, K0: Tensor, K1: Tensor, po
 
 def plane_matches(
     state: State, plane: Tensor, matches: Located, templates: Sequence[Template], views: Sequence[View]
-) -> PlaneMatches | None:
-    """Matches that are off the objects in both views; ``plane`` (3, 3) is the covariance of what is known of the plane."""
+) -> list[EpipolarMatches | PlaneMatches]:
+    """Terms of matches that are off the objects in both views; ``plane`` (3, 3) is the covariance of what is known of it."""
     free = _at(~grown(templates[0].owner >= 0, CLEAR), matches.points_0)
     free &= _at(~grown(templates[1].owner >= 0, CLEAR), matches.points_1)
-    # what is above the horizon is not on the plane, but its motion counts: it is far away, so leave it out
-    free &= state.offset / (pixel_rays(views[0].K, matches.points_0) @ state.normal) > 0
     if not bool(free.any()):
-        return None
-    return PlaneMatches.of(state, plane, views[0].K, views[1].K, *(x[free] for x in matches))
+        return []
+    return list(plane_terms(state, plane, views[0].K, views[1].K, *(x[free] for x in matches)))
 
 
 def surface_matches(

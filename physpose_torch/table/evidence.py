@@ -18,6 +18,7 @@ from physpose_torch.table.view import pixel_rays, project
 __all__ = [
     "CommonDepth",
     "Contact",
+    "EpipolarMatches",
     "Gravity",
     "NotBelow",
     "ModelPoints",
@@ -26,6 +27,7 @@ __all__ = [
     "PosePrior",
     "SurfaceMatches",
     "few",
+    "plane_terms",
 ]
 
 
@@ -37,6 +39,8 @@ INDEPENDENT = 300.0
 """Matches on the table count as this many at the most: neither lenses nor tables are perfect."""
 GATE = 4.0
 """Standard deviations within which a match may be on the plane …"""
+NEAREST, FARTHEST = 0.05, 20.0
+"""[m]; depths between which a table may be."""
 SLACK = 0.5
 """… with so much to spare [px]."""
 
@@ -168,19 +172,38 @@ class Gravity:
 
 
 @dataclass(frozen=True, eq=False)
-class PlaneMatches:
-    """Matches off the objects: on the epipolar line, wherever they are; and where the plane puts them, if they are on it.
+class EpipolarMatches:
+    """Matches off the objects lie on their epipolar lines, whatever they are on."""
 
-    A match is a point in view 0 and, known less well, one in view 1. The plane moves it along its epipolar line only, so the
-    two directions tell of different things and are rows of their own, each with its own weight.
-    """
+    rays: Tensor
+    """(M, 3) of the points in view 0."""
+    depth: Tensor
+    """(M,) any depth [m]: it moves points along their lines only."""
+    points_1: Tensor
+    """(M, 2) [px]."""
+    across: Tensor
+    """(M, 2) across the line, divided by the standard deviation [1/px]; of the state it was made for."""
+    K1: Tensor
+    weight: Tensor
+    nu: float = 4.0
+    owner: None = None
+
+    def residual(self, x: Unknowns) -> Tensor:
+        """(M, 1)."""
+        off = project(self.K1, _moved(x, self.depth[:, None] * self.rays)) - self.points_1
+        return (self.across * off).sum(-1, keepdim=True)
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneMatches:
+    """Matches that may be on the plane are where it puts them along their epipolar lines; across, it has no say."""
 
     rays: Tensor
     """(M, 3) of the points in view 0."""
     points_1: Tensor
     """(M, 2) [px]."""
-    whitening: Tensor
-    """(M, 2, 2): across the epipolar line, then along it given that; of the state it was made for."""
+    along: Tensor
+    """(M, 2) along the line, given what is across, divided by the standard deviation [1/px]."""
     K1: Tensor
     weight: Tensor
     cost: float = 0.0
@@ -188,43 +211,51 @@ class PlaneMatches:
     nu: float = 4.0
     owner: None = None
 
-    @classmethod
-    def of(
-        cls, state: State, plane: Tensor, K0: Tensor, K1: Tensor, points_0: Tensor, points_1: Tensor, covariance: Tensor
-    ) -> "PlaneMatches":
-        """Matches (M, 2), (M, 2) with covariances (M, 2, 2) [px²] of the second.
-
-        Where a match lies along its epipolar line counts only if it may be on the plane, as well as that is known: with
-        covariance ``plane`` (3, 3). There are other planes in the world, a floor above all, and more of them is seen.
-        """
-        rays = pixel_rays(K0, points_0)
-        near = (state.offset / (rays @ state.normal))[:, None] * rays
-        R, t = state.T_view1_view0[:3, :3], state.T_view1_view0[:3, 3]
-        where = project(K1, near @ R.mT + t)
-        along = (project(K1, 1.01 * near @ R.mT + t) - where) / 0.01
-        length = torch.linalg.vector_norm(along, dim=1, keepdim=True)
-        along = torch.where(length > 1e-9, along / length.clamp_min(1e-9), along.new_tensor([1.0, 0.0]))
-        turn = torch.stack([torch.stack([-along[:, 1], along[:, 0]], 1), along], 1)
-        turned = turn @ covariance @ turn.mT
-        whitening = torch.linalg.solve_triangular(torch.linalg.cholesky(turned), turn, upper=False)
-
-        lever = (near - state.middle) @ tangent_basis(state.normal[None])[0].mT
-        lever = torch.cat([lever, torch.ones_like(lever[:, :1])], 1)
-        # a plane that is higher by h is nearer by h / offset of the depth
-        wander = torch.einsum("mi,ij,mj->m", lever, plane, lever) * (length[:, 0] / state.offset) ** 2
-        off = ((where - points_1) * along).sum(1)
-        across = few(torch.zeros(len(rays), dtype=torch.int64), INDEPENDENT)
-        on = off**2 < GATE**2 * (turned[:, 1, 1] + wander + SLACK**2)
-        along = torch.where(on, few(torch.zeros(int(on.sum()), dtype=torch.int64), INDEPENDENT).sum() / on.sum(), 0.0)
-        elsewhere = 0.5 * (cls.nu + 1) * math.log1p(GATE**2 / cls.nu)
-        cost = elsewhere * float(across[~on].sum())
-        return cls(rays, points_1, whitening, K1, torch.cat([across, along]), cost)
-
     def residual(self, x: Unknowns) -> Tensor:
-        """(2 M, 1): all that is across, then all that is along."""
+        """(M, 1)."""
         depth = x.offset[..., None] / (x.normal @ self.rays.mT)
         off = project(self.K1, _moved(x, depth[..., None] * self.rays)) - self.points_1
-        return _turned(self.whitening, off).mT.flatten(-2)[..., None]
+        return (self.along * off).sum(-1, keepdim=True)
+
+
+def plane_terms(
+    state: State, plane: Tensor, K0: Tensor, K1: Tensor, points_0: Tensor, points_1: Tensor, covariance: Tensor
+) -> tuple[EpipolarMatches, PlaneMatches]:
+    """Terms of matches (M, 2), (M, 2) off the objects, the second with covariances (M, 2, 2) [px²].
+
+    Where a match lies along its epipolar line counts only if it may be on the plane, as well as that is known: with covariance
+    ``plane`` (3, 3). There are other planes in the world, a floor above all, and often more of them is seen.
+    """
+    rays = pixel_rays(K0, points_0)
+    depth = state.offset / (rays @ state.normal)
+    ahead = (depth > NEAREST) & (depth < FARTHEST)  # else above the horizon
+    depth = torch.where(ahead, depth, 1.0)
+    near = depth[:, None] * rays
+    R, t = state.T_view1_view0[:3, :3], state.T_view1_view0[:3, 3]
+    where = project(K1, near @ R.mT + t)
+    along = (project(K1, 1.01 * near @ R.mT + t) - where) / 0.01
+    length = torch.linalg.vector_norm(along, dim=1, keepdim=True)
+    along = torch.where(length > 1e-9, along / length.clamp_min(1e-9), along.new_tensor([1.0, 0.0]))
+    turn = torch.stack([torch.stack([-along[:, 1], along[:, 0]], 1), along], 1)
+    turned = turn @ covariance @ turn.mT
+    whitening = torch.linalg.solve_triangular(torch.linalg.cholesky(turned), turn, upper=False)
+    off = _turned(whitening, where - points_1)
+
+    lever = (near - state.middle) @ tangent_basis(state.normal[None])[0].mT
+    lever = torch.cat([lever, torch.ones_like(lever[:, :1])], 1)
+    # a plane that is higher by h is nearer by h / offset of the depth
+    wander = torch.einsum("mi,ij,mj->m", lever, plane, lever) * (length[:, 0] / state.offset) ** 2
+    shift = ((where - points_1) * along).sum(1)
+    on = ahead & (off[:, 0].abs() < GATE) & (shift**2 < GATE**2 * (turned[:, 1, 1] + wander + SLACK**2))
+    together = torch.zeros(len(rays), dtype=torch.int64)
+    weight = few(together, INDEPENDENT)
+    elsewhere = 0.5 * (PlaneMatches.nu + 1) * math.log1p(GATE**2 / PlaneMatches.nu)
+    return (
+        EpipolarMatches(rays, depth, points_1, whitening[:, 0], K1, weight),
+        PlaneMatches(
+            rays[on], points_1[on], whitening[on, 1], K1, few(together[on], INDEPENDENT), elsewhere * float(weight[~on].sum())
+        ),
+    )
 
 
 @dataclass(frozen=True, eq=False)

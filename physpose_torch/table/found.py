@@ -24,6 +24,8 @@ __all__ = ["Found", "Problem", "check_near_objects", "located_matches", "object_
 
 NEAR = 0.06
 """[m]; the lowest point of some object is no farther from the table than this."""
+UPRIGHT = math.radians(10.0)
+"""… that is tilted by no more than this from a face it can stand on."""
 BELOW = 0.03
 """[m]; and no more than half of the objects are deeper in it than this."""
 OUTLYING = 4.0
@@ -188,10 +190,10 @@ def check_near_objects(problem: Problem, found: Sequence[Found], method: str) ->
     here = poses.isfinite().flatten(1).all(1)
     best, most = None, -1.0
     for plane in found:
-        lowest = standing_on(problem.bodies, poses, plane.normal).lowest
-        height = (se3.apply(poses, lowest[:, None])[:, 0] @ plane.normal - plane.offset)[here]
+        feet = standing_on(problem.bodies, poses, plane.normal)
+        height = (se3.apply(poses, feet.lowest[:, None])[:, 0] @ plane.normal - plane.offset)[here]
         slack = 2 * problem.config.sigma_ray_fraction * torch.linalg.vector_norm(poses[here, :3, 3], dim=1)
-        near = (height.abs() < NEAR + slack).double().mean()
+        near = ((height.abs() < NEAR + slack) & (feet.tilt[here] < UPRIGHT)).double().mean()
         if problem.gravity is not None:
             near = near - 2.0 * ((-plane.normal @ problem.gravity) < 0.9)
         if float((height < -BELOW - slack).double().mean()) > 0.5 or float(near) <= 0:

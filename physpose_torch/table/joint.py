@@ -213,9 +213,8 @@ def _fit_all(
         state = fit.state
     if matches is not None:
         for schedule in (FINE[:3], FINE[3:]):
-            off_objects = plane_matches(state, fit.covariance, matches, evidence[0], problem.views)
             terms = _object_terms(problem, state, evidence, matches, two)
-            terms += [off_objects] if off_objects is not None else []
+            terms += plane_matches(state, fit.covariance, matches, evidence[0], problem.views)
             fit = adjust(state, terms, schedule)
             state = fit.state
     return fit, terms
@@ -301,8 +300,7 @@ def _solution(problem: Problem, fit: Fit, terms: Sequence[Term], rival: float, t
         if isinstance(term, PosePrior):
             priors.append(squared)
         if isinstance(term, PlaneMatches):
-            across, along = squared.reshape(2, -1)
-            on = (across < FITS) & (along < FITS) & (term.weight[len(across) :] > 0)
+            on = squared < FITS
             points_0 = term.rays[on] @ problem.views[0].K.mT
             table = Matches(points_0[:, :2], term.points_1[on], torch.ones(int(on.sum())))
     disagreement = float(torch.cat(priors).median()) if priors else 0.0
