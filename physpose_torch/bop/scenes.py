@@ -1,6 +1,7 @@
 """From a BOP result file to scenes and back: one scene an image, with what could not be used set aside."""
 
-from collections.abc import Container, Iterator, Mapping, Sequence
+import logging
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,6 +18,7 @@ from physpose_torch.scene import Scene, Static
 __all__ = ["BodyLibrary", "ImageScene", "image_scenes", "plane_of"]
 
 MM = 1e-3
+logger = logging.getLogger("physpose_torch")
 
 
 class BodyLibrary:
@@ -93,6 +95,7 @@ def image_scenes(
     *,
     planes: Mapping[tuple[int, int], PlaneRecord] | None = None,
     plane_sigma: float = 0.0,
+    find_table: Callable[[int, int, Scene, np.ndarray], tuple[Plane, tuple[str, ...]]] | None = None,
     statics: Sequence[StaticRecord] = (),
     counts: Mapping[tuple[int, int, int], int] | None = None,
     broken: Mapping[tuple[int, int], list[str]] | None = None,
@@ -106,6 +109,8 @@ def image_scenes(
         planes: table plane by (scene_id, im_id); an image without one gets no gravity and is refined by collisions only,
             and says so if ``planes`` is given at all. None: collisions only, everywhere.
         plane_sigma: σ of the height of planes that state none [m].
+        find_table: estimates the plane of images that ``planes`` has none for: (scene_id, im_id, scene of the objects, rows)
+            to the plane, and what should be known of it.
         statics: static bodies, see :func:`physpose_torch.bop.formats.read_statics`.
         counts: (scene_id, im_id, obj_id) → number of instances, from a targets file.
         broken: images with rows or planes that cannot be used, and why; they are left alone.
@@ -117,34 +122,39 @@ def image_scenes(
             images.setdefault(key, []).append(row)
     for key, rows in images.items():
         image = ImageScene(*key, np.array(rows), problems=list((broken or {}).get(key, [])))
-        if not image.problems and planes is not None and key not in planes:
+        if not image.problems and planes is not None and key not in planes and find_table is None:
             image.problems.append(f"{image.name}: no plane in the planes file; add one, or leave out --planes")
         if not image.problems:
             try:
-                image.scene = _scene(image, estimates, library, planes, plane_sigma, statics, counts or {})
+                image.scene = _scene(image, estimates, library, planes, plane_sigma, find_table, statics, counts or {})
             except PhysPoseError as error:
                 image.problems.append(f"{image.name}: {error}")
         yield image
 
 
-def _scene(image, estimates, library, planes, plane_sigma, statics, counts) -> Scene:
+def _scene(image, estimates, library, planes, plane_sigma, find_table, statics, counts) -> Scene:
     key = (image.scene_id, image.im_id)
     obj_ids = estimates.obj_id[image.rows].tolist()
     objects = [library.model(i) for i in obj_ids]
-    standing, gravity = [], None
-    if planes is not None:
+    known = {
+        (0, body.label): counts[(*key, i)] for i, body in zip(obj_ids, objects, strict=True) if (*key, i) in counts
+    }
+    measured, scores = poses_of([image], estimates)
+    same = find_alternatives(measured, Scene(objects), scores, counts=known)
+    plane, standing, gravity = None, [], None
+    if planes is not None and key in planes:
         plane = plane_of(planes[key], sigma=plane_sigma)
+    elif find_table is not None:
+        plane, warnings = find_table(*key, Scene(objects, same_object=same), image.rows)
+        for warning in warnings:
+            logger.warning("%s: table: %s", image.name, warning)
+    if plane is not None:
         standing.append(Static(plane))
         gravity = -plane.normal
     for record in statics:
         pose = record.pose(*key)
         if pose is not None:
             standing.append(Static(library.static(record), pose))
-    known = {
-        (0, body.label): counts[(*key, i)] for i, body in zip(obj_ids, objects, strict=True) if (*key, i) in counts
-    }
-    measured, scores = poses_of([image], estimates)
-    same = find_alternatives(measured, Scene(objects), scores, counts=known)
     return Scene(objects, standing, gravity=gravity, same_object=same)
 
 

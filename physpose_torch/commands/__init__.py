@@ -14,6 +14,7 @@ from physpose_torch.commands.demo import Demo
 from physpose_torch.commands.eval import Eval
 from physpose_torch.commands.refine import Refine
 from physpose_torch.commands.report import Report
+from physpose_torch.commands.table import Table
 from physpose_torch.config import RefinerConfig
 from physpose_torch.errors import InvalidInputError
 
@@ -26,6 +27,7 @@ COMMANDS = {
     "eval": Eval,
     "calibrate": Calibrate,
     "ablate": Ablate,
+    "table": Table,
     "decompose": Decompose,
 }
 PRESETS = {"default": RefinerConfig, "lm": RefinerConfig.lm, "paper": RefinerConfig.paper}
@@ -39,7 +41,7 @@ def parse(args: Sequence[str]) -> Any:
     choices = []
     for name, command in COMMANDS.items():
         options = {}
-        if "config" in command.__dataclass_fields__:
+        if "preset" in command.__dataclass_fields__:
             own = config
             if command is Refine and calibration is not None and args[0] == name:
                 own = config.calibrated(read_calibration(calibration))

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, NamedTuple, TypeVar
+from typing import Annotated, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import tyro
@@ -12,7 +12,10 @@ import tyro
 from physpose_torch.bop.dataset import BopDataset
 from physpose_torch.bop.formats import Estimates, read_estimates, read_planes, read_statics
 from physpose_torch.bop.scenes import BodyLibrary, ImageScene, image_scenes
+from physpose_torch.bop.table import TablesOnTheWay, read_pairs
+from physpose_torch.config import TableConfig
 from physpose_torch.errors import InvalidInputError, PhysPoseError
+from physpose_torch.table.estimator import TableEstimator
 
 __all__ = ["ImageOptions", "Images", "in_batches", "together"]
 
@@ -41,6 +44,12 @@ class ImageOptions:
     """BOP dataset folder."""
     planes: Path | None = None
     """Table planes: {scene: {image: {"normal": [3], "offset_mm": x}}} or {"R": 3x3, "t": [m]}. Without: collisions only."""
+    table: Literal["auto", "joint", "support"] | None = None
+    """Estimate the table plane of images that PLANES has none for: from the objects' poses and, with auto and joint, from the
+    dataset's images or those that PAIRS names."""
+    pairs: Path | None = None
+    """Second images for --table: {scene: {image: {"second": image, "files": [first, second]}}}, files only where the dataset
+    has no images."""
     plane_sigma_mm: float = 2.0
     """Standard deviation of the height of planes whose entry states none; contacts are as soft. 0: they are exact. Scans,
     true poses and tables agree to a few mm, not better."""
@@ -101,6 +110,7 @@ class ImageOptions:
             estimates,
             BodyLibrary(dataset),
             planes=planes,
+            find_table=self._tables(estimates, dataset),
             plane_sigma=self.plane_sigma_mm / 1000,
             statics=statics,
             counts=counts,
@@ -108,6 +118,15 @@ class ImageOptions:
             wanted=set(keys),
         )
         return Images(estimates, dataset, sum(k in readable for k in keys) + len(rest), chain(images, rest))
+
+
+    def _tables(self, estimates: Estimates, dataset: BopDataset) -> TablesOnTheWay | None:
+        if self.table is None:
+            if self.pairs is not None:
+                raise InvalidInputError(f"--pairs {self.pairs} says where second images are; add --table auto to use them")
+            return None
+        pairs = read_pairs(self.pairs) if self.pairs is not None else {}
+        return TablesOnTheWay(estimates, dataset, pairs, TableEstimator(TableConfig(method=self.table)))
 
 
 def in_batches(images: Iterable[ImageScene], size: int) -> Iterator[list[ImageScene]]:

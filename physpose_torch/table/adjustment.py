@@ -141,7 +141,7 @@ def _normal_equations(state: State, terms: Sequence[Term], scale: float):
     """Gauss–Newton matrix and gradient, the cost at scale one, and every row's squared length."""
     n = len(state.poses)
     columns = SHARED + 6
-    # forward differences, all columns in one go: forward-mode differentiation of as many small functions takes ten times as long
+    # forward differences, all columns in one go: forward-mode differentiation of so many small functions takes eight times longer
     steps = torch.cat([state.middle.new_zeros(1, columns), DIFFERENCE * torch.eye(columns, dtype=state.middle.dtype)])
     x = _unknowns(state, steps)
     zero = steps[0]

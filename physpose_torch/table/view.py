@@ -43,6 +43,12 @@ class View:
         object.__setattr__(self, "K", K.cpu())
         if self.image is not None:
             object.__setattr__(self, "image", _checked_image(self.image))
+            height, width = self.image.shape[:2]
+            if not (0 < float(K[0, 2]) < width and 0 < float(K[1, 2]) < height):
+                raise InvalidInputError(
+                    f"View.K has its principal point at ({float(K[0, 2]):.1f}, {float(K[1, 2]):.1f}) px, outside of an image "
+                    f"of {width} x {height} px; intrinsics and image are of different sizes"
+                )
         if self.poses is not None:
             poses = torch.as_tensor(self.poses)
             if poses.is_floating_point() and poses.ndim == 3:
