@@ -25,6 +25,7 @@ from physpose_torch.bench.pairs import batches_table, bench_batches, bench_pairs
 from physpose_torch.bench.part_pairs import make_part_pairs
 from physpose_torch.bench.plot import plot_costs
 from physpose_torch.bench.scenes import bench_scenes, make_config, scenes_table
+from physpose_torch.bench.tables import TableOptions, run_tables
 from physpose_torch.distance.autograd import backends
 from physpose_torch.errors import InvalidInputError, PhysPoseError
 
@@ -143,8 +144,18 @@ class Growth(_Bench):
 
 
 @dataclass(frozen=True)
+class Table(TableOptions, _Bench):
+    """The table's plane from images and noisy poses: errors, failures, and how far its covariance is to be believed."""
+
+    def run(self, results: dict[str, Any], device: torch.device) -> None:
+        if self.plot is not None:
+            raise InvalidInputError("--plot: table measures no cost against size; use --json")
+        run_tables(results, self, self.data, self.seed)
+
+
+@dataclass(frozen=True)
 class All(_Bench):
-    """All three with modest sizes: what runs without a subcommand."""
+    """Pairs, scenes and growth with modest sizes: what runs without a subcommand."""
 
     pairs: int = 3000
     """Part pairs, a third of each kind."""
@@ -158,7 +169,7 @@ class All(_Bench):
         Growth(**common).run(results, device)
 
 
-COMMANDS = {"all": All, "pairs": Pairs, "scenes": Scenes, "growth": Growth}
+COMMANDS = {"all": All, "pairs": Pairs, "scenes": Scenes, "growth": Growth, "table": Table}
 
 
 def run_pairs(results, device, count, data, seed, names) -> None:

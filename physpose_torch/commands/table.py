@@ -92,7 +92,7 @@ def _described(estimate: TableEstimate) -> str:
     normal = " ".join(f"{x:.4f}" for x in plane.normal.tolist())
     lines = [
         f"normal    {normal}   known to {np.degrees(estimate.sigma_tilt):.2f} deg",
-        f"offset    {1e3 * float(plane.offset):.1f} mm   its height at the objects known to {1e3 * estimate.sigma_offset:.1f} mm",
+        f"offset    {1e3 * float(plane.offset):.1f} mm   its height at the objects to {1e3 * estimate.sigma_offset:.1f} mm",
         f"method    {estimate.method}: {int(estimate.standing.sum())} of {len(estimate.standing)} objects stand on it, "
         f"{estimate.inliers} matches lie on it",
     ]

@@ -25,8 +25,6 @@ SHARED = 10
 """Unknowns that all rows may see: second camera (6), plane (3), depth factor (1); then six of the row's own object."""
 RIDGE = (1.0, 1e-4, 1.0)
 """Weight that keeps the second camera, objects and plane from running where nothing holds them, in units of 1 m and 1 rad."""
-SCALE = 0.002
-"""Standard deviation of the scale of everything that is seen: focal lengths and models are known no better."""
 DIFFERENCE = 1e-6
 """Step of the differences that stand for derivatives [m, rad, 1]."""
 LARGEST_STEP = 0.3
@@ -101,9 +99,7 @@ def adjust(state: State, terms: Sequence[Term], schedule: Sequence[float]) -> Fi
         matrix, gradient, _, _ = _normal_equations(state, terms, scale)
         state = _moved(state, -torch.linalg.solve(matrix, gradient).clamp(-LARGEST_STEP, LARGEST_STEP))
     matrix, _, cost, surprise = _normal_equations(state, terms, 1.0)
-    covariance = torch.linalg.inv(matrix)[6:9, 6:9]
-    covariance[2, 2] += (SCALE * state.offset) ** 2
-    return Fit(state, covariance, cost, surprise)
+    return Fit(state, torch.linalg.inv(matrix)[6:9, 6:9], cost, surprise)
 
 
 def _unknowns(state: State, step: Tensor) -> Unknowns:
@@ -141,7 +137,7 @@ def _normal_equations(state: State, terms: Sequence[Term], scale: float):
     """Gauss–Newton matrix and gradient, the cost at scale one, and every row's squared length."""
     n = len(state.poses)
     columns = SHARED + 6
-    # forward differences, all columns in one go: forward-mode differentiation of so many small functions takes eight times longer
+    # forward differences, all columns in one go: forward-mode differentiation of so many small functions takes far longer
     steps = torch.cat([state.middle.new_zeros(1, columns), DIFFERENCE * torch.eye(columns, dtype=state.middle.dtype)])
     x = _unknowns(state, steps)
     zero = steps[0]

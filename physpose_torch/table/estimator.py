@@ -294,6 +294,8 @@ class TableEstimator:
         from physpose_torch.table.standing import standing_on
 
         covariance = 0.5 * (covariance + covariance.mT)
+        if method != "support":
+            covariance[2, 2] += (self.config.sigma_scale * offset) ** 2
         tilt = float(torch.linalg.eigvalsh(covariance[:2, :2]).amax().clamp_min(0).sqrt())
         height = float(covariance[2, 2].clamp_min(0).sqrt())
         if not (tilt < self.config.widest_tilt and height < self.config.widest_offset):

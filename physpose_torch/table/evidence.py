@@ -35,7 +35,7 @@ LEANING = math.radians(20.0)
 """What is tilted by more than this from all faces it could stand on stands on none."""
 FAR = 0.05
 """[m]; as unlikely as standing so far above the table is leaning."""
-INDEPENDENT = 300.0
+INDEPENDENT = 100.0
 """Matches on the table count as this many at the most: neither lenses nor tables are perfect."""
 GATE = 4.0
 """Standard deviations within which a match may be on the plane …"""

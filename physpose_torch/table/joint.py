@@ -37,6 +37,10 @@ STANDS = 16.0
 """Squared deviation of the feet of an object that stands, in standard deviations of contacts; about three count."""
 FITS = 9.0
 """The same of a match that is where it should be."""
+HOPELESS = 100.0
+"""A plane whose cost by the poses alone is this much higher will not be the table."""
+SAME_MOTION = (math.radians(1.0), 0.1)
+"""Motions that differ by less than this, in rotation [rad] and in position as a share of the baseline, end alike."""
 ENOUGH = 12
 """Points of an object's texture that were found, from which on its outline is not needed."""
 REACH = (10, 4)
@@ -119,7 +123,8 @@ def fit_joint(problem: Problem, find_matches: Callable[[Tensor, Tensor], Matches
     evidence = _aligned(problem, state, grays, REACH[0], two)
     fits: list[Fit] = []
     starts = [(state, m) for m in motions or [state.T_view1_view0]]
-    starts += [(fit.state, None) for fit in supported[1:3]]
+    rivals = [fit for fit in supported[1:] if fit.cost < supported[0].cost + HOPELESS and _differ(fit.state, state)]
+    starts += [(fit.state, None) for fit in rivals[:2]]
     for start, motion in starts:
         start = start._replace(T_view1_view0=motion if motion is not None else fits[0].state.T_view1_view0)
         fit, _ = _fit_all(problem, start, evidence, matches if two else None, two, ROUGH)
@@ -244,6 +249,11 @@ def _motions(problem: Problem, by_objects: Tensor | None, matches: Located | Non
     length = (template.depth[y, x] / points[:, 2])[on].median()
     by_matches = unit.clone()
     by_matches[:3, 3] *= length
+    if motions:
+        turn = float(se3.log_so3(by_matches[:3, :3].mT @ motions[0][:3, :3]).norm())
+        shift = float((by_matches - motions[0])[:3, 3].norm() / by_matches[:3, 3].norm())
+        if turn < SAME_MOTION[0] and shift < SAME_MOTION[1]:
+            return [by_matches]
     return [by_matches, *motions]
 
 
