@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 
@@ -48,6 +48,8 @@ class TableScene:
     """In view 0."""
     meshes: dict[str, trimesh.Trimesh] | None = None
     """Coloured meshes by label [m]; None: they are YCB's."""
+    plain: dict[str, trimesh.Trimesh] | None = None
+    """The same shapes in fewer triangles, to be decomposed; None: decompose ``meshes``."""
     obj_ids: tuple[int, ...] = ()
     """Of YCB objects."""
     root: Path | None = None
@@ -63,12 +65,12 @@ class TableScene:
         """The objects with their colours (``models_textured``) or without; with convex parts (CoACD), or the hull alone."""
         if self.meshes is None:
             return [ycbv_body(self.root, k, models, decomposed) for k in self.obj_ids]
-        make = Body.from_mesh if decomposed else Body.from_hull
         found = []
         for name, mesh in self.meshes.items():
-            if models == "models":
-                mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-            found.append(make(mesh, label=name))
+            body = Body.from_mesh((self.plain or self.meshes)[name], label=name) if decomposed else None
+            colored = Body.from_hull(mesh, label=name)
+            body = colored if body is None else replace(body, appearance=colored.appearance)
+            found.append(body if models != "models" else replace(body, appearance=None))
         return found
 
     def views(self, count: int, draw: int, bias: float, *, seed: int = 0) -> list[View]:
@@ -120,8 +122,10 @@ def pair_scenes(data: Path) -> Iterator[TableScene]:
 
 def generated_scenes(count: int, seed: int = 0) -> Iterator[TableScene]:
     """Generated photographs on all tables in turn, with two to seven objects. What cannot be arranged is left out."""
+    from physpose_torch.household import household_meshes
     from physpose_torch.photograph import TABLES, household_pair
 
+    plain = household_meshes()
     for k in range(seed, seed + count):
         table, objects = TABLES[k % len(TABLES)], FEWEST + k % (MOST - FEWEST + 1)
         try:
@@ -137,6 +141,7 @@ def generated_scenes(count: int, seed: int = 0) -> Iterator[TableScene]:
             truth=pair.T_camera_object,
             plane=Plane(pair.normal, pair.offset),
             meshes=pair.meshes,
+            plain=plain,
         )
 
 

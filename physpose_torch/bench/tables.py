@@ -32,7 +32,7 @@ from physpose_torch.scene import Scene
 from physpose_torch.table.estimator import TableEstimate, TableEstimator
 from physpose_torch.table.view import View
 
-__all__ = ["TableOptions", "deviation", "measure", "run_tables", "summarise"]
+__all__ = ["TableOptions", "deviation", "measure", "plane_errors", "run_tables", "summarise"]
 
 THREE_SIGMA = 14.16
 """χ² with three degrees of freedom is below this with probability 0.9973."""
@@ -115,7 +115,7 @@ def run_tables(results: dict[str, Any], options: TableOptions, data: Path | None
         print(f"\n{dataset}, {len(chosen)} scenes × {options.draws} draws; {models}, {views} view(s), bias {bias:g}")
         summary = [{**what, **summarise(m, [r for r in rows if r["method"] == m])} for m in given]
         results["tables"] += summary
-        print(tables_table(summary))
+        print(tables_table(summary), flush=True)
         if options.downstream:
             print(f"\nthe same, refined\n{downstream_table(rows, list(given))}")
         for row in rows:
@@ -142,8 +142,7 @@ def measure(
         failure = f"{type(error).__name__}: {error}"
         return {**row, "failure": failure, "crashed": True, "seconds": time.perf_counter() - start}, None
     found = estimate.plane
-    angle = math.degrees(math.atan2(*_sine_cosine(found.normal, plane.normal)))
-    offset = 1e3 * float(found.normal @ middle - found.offset)
+    angle, offset = plane_errors(found, plane, middle)
     off = deviation(estimate, bodies, plane)
     row |= {
         "seconds": time.perf_counter() - start,
@@ -160,6 +159,13 @@ def measure(
         "wrong": not estimate.warnings and (angle > WRONG_ANGLE or abs(offset) > WRONG_OFFSET),
     }
     return row, estimate
+
+
+def plane_errors(found: Plane, plane: Plane, middle: Tensor) -> tuple[float, float]:
+    """Angle between the normals [deg], and signed distance from the plane that was found to a point of the true one [mm]."""
+    sine = torch.linalg.vector_norm(torch.linalg.cross(found.normal, plane.normal))
+    angle = math.degrees(math.atan2(float(sine), float(found.normal @ plane.normal)))
+    return angle, 1e3 * float(found.normal @ middle - found.offset)
 
 
 def deviation(estimate: TableEstimate, bodies: Sequence[Body], plane: Plane) -> Tensor:
@@ -263,10 +269,6 @@ def _errors(poses: Tensor, scene: TableScene, truth: Scene) -> dict[str, float]:
     deepest = -float(object_heights(poses, truth).min())
     errors = {"centre_mm": np.mean(centre), "surface_mm": np.mean(surface), "deepest_mm": max(deepest, 0.0)}
     return {k: 1e3 * float(v) for k, v in errors.items()}
-
-
-def _sine_cosine(a: Tensor, b: Tensor) -> tuple[float, float]:
-    return float(torch.linalg.vector_norm(torch.linalg.cross(a, b))), float(a @ b)
 
 
 def _numbers(values: Sequence[float], digits: int) -> list[str]:

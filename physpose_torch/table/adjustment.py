@@ -15,7 +15,7 @@ from torch import Tensor
 from physpose_torch import se3
 from physpose_torch.distance.smoothing import tangent_basis
 
-__all__ = ["FINE", "ROUGH", "Fit", "State", "Term", "Unknowns", "adjust"]
+__all__ = ["FINE", "ROUGH", "Fit", "State", "Term", "Unknowns", "adjust", "unknowns_at"]
 
 ROUGH = (8.0, 8.0, 6.0, 4.0, 3.0, 2.0, 1.5, 1.0, 1.0, 1.0)
 """Scales of the weights from a rough start, one a step."""
@@ -75,6 +75,8 @@ class Term(Protocol):
     """(G,) how much each row counts; less than 1 where many rows err together."""
     nu: float
     """Degrees of freedom of the Student-t distribution; infinite: normal."""
+    cap: float | None
+    """If given, a row costs this much at the most (Geman and McClure 1985), however far off: what it says need not be true."""
 
     def residual(self, x: Unknowns) -> Tensor:
         """(G, K)."""
@@ -100,6 +102,11 @@ def adjust(state: State, terms: Sequence[Term], schedule: Sequence[float]) -> Fi
         state = _moved(state, -torch.linalg.solve(matrix, gradient).clamp(-LARGEST_STEP, LARGEST_STEP))
     matrix, _, cost, surprise = _normal_equations(state, terms, 1.0)
     return Fit(state, torch.linalg.inv(matrix)[6:9, 6:9], cost, surprise)
+
+
+def unknowns_at(state: State) -> Unknowns:
+    """The state as terms take it, with one leading dimension of length 1."""
+    return _unknowns(state, state.middle.new_zeros(1, SHARED + 6))
 
 
 def _unknowns(state: State, step: Tensor) -> Unknowns:
@@ -152,7 +159,7 @@ def _normal_equations(state: State, terms: Sequence[Term], scale: float):
         J = (torch.stack(moved, -1) - r[..., None]) / DIFFERENCE
         squared = (r**2).sum(1)
         surprise.append(squared)
-        weight, loss = _student(squared, r.shape[1], term.nu, scale)
+        weight, loss = _robust(squared, r.shape[1], term, scale)
         cost += float((term.weight * loss).sum()) + getattr(term, "cost", 0.0)
         weight = weight * term.weight
         weighted = weight[:, None, None] * J
@@ -174,9 +181,12 @@ def _normal_equations(state: State, terms: Sequence[Term], scale: float):
     return matrix + torch.diag(ridge), torch.cat([gradient, gradient_own.flatten()]), cost, tuple(surprise)
 
 
-def _student(squared: Tensor, dimensions: int, nu: float, scale: float) -> tuple[Tensor, Tensor]:
+def _robust(squared: Tensor, dimensions: int, term: Term, scale: float) -> tuple[Tensor, Tensor]:
     """Weights at a scale, and losses at scale one, of rows with these squared lengths."""
-    if nu == float("inf"):
+    if term.cap is not None:
+        limit = 2.0 * term.cap
+        return (limit / (limit + squared / scale**2)) ** 2, 0.5 * squared * limit / (limit + squared)
+    if term.nu == float("inf"):
         return torch.ones_like(squared), 0.5 * squared
-    weight = (nu + dimensions) / (nu + squared / scale**2)
-    return weight, 0.5 * (nu + dimensions) * torch.log1p(squared / nu)
+    weight = (term.nu + dimensions) / (term.nu + squared / scale**2)
+    return weight, 0.5 * (term.nu + dimensions) * torch.log1p(squared / term.nu)

@@ -29,9 +29,9 @@ STILL = 1.0
 """[px]; matches that move by less than this, in the median, show no other view."""
 RIVAL = 3.0
 """Two planes whose costs differ by less than this are about as likely."""
-DISAGREE = 60.0
-"""Squared deviation of an object's estimated pose, 6 in the mean if all is well; if the typical one is above this, something
-is wrong with all of them."""
+DISAGREE = 7.0
+"""Squared deviation of the typical object from its estimate across the viewing ray, 2 in the mean if all is well; above this,
+something is wrong with all of them."""
 FEW_MATCHES = 8
 """Fewer matches on the table than this say little of it."""
 
@@ -146,8 +146,13 @@ class TableEstimator:
                 )
             none = torch.full((len(bodies), 4, 4), torch.nan, dtype=torch.float64)
             measured.append(none if view.poses is None else view.poses.detach().to("cpu", torch.float64).clone())
-        if not len(bodies) or not any(bool(m.isfinite().all(-1).any()) for m in measured):
+        seen = [bool(m.isfinite().flatten(1).all(1).any()) for m in measured]
+        if not any(seen):
             raise TableNotFoundError("no object has an estimated pose; without objects nothing tells how large things are")
+        if not seen[0]:
+            raise TableNotFoundError(
+                "no object has an estimated pose in view 0, in whose camera the plane is wanted; swap the views"
+            )
         if gravity is not None:
             gravity = torch.as_tensor(gravity).detach().to("cpu", torch.float64)
             if gravity.shape != (3,) or not abs(float(torch.linalg.vector_norm(gravity)) - 1) < 1e-3:
@@ -161,8 +166,6 @@ class TableEstimator:
 
         method = self.config.method
         if method in ("homography", "paper"):
-            if not bool(problem.measured[0].isfinite().flatten(1).all(1).any()):
-                raise TableNotFoundError(f"method {method!r} needs poses in view 0; use 'auto'")
             if method == "paper":
                 found = fit_paper(problem, self._find_matches, self.models)
             else:
@@ -194,7 +197,7 @@ class TableEstimator:
             if not fits:
                 raise TableNotFoundError("images and estimated poses contradict each other; check the intrinsics")
             rival = rival_cost(fits)
-            fit = fits[0]._replace(covariance=fits[0].covariance * solution.disagreement / 6.0)
+            fit = fits[0]._replace(covariance=fits[0].covariance * solution.disagreement / 2.0)
             return self._of_fit(problem, fit, "support", rival, None, warnings, two=False)
         two = solution.two
         return self._of_fit(problem, solution.fit, "joint", solution.rival, solution.table, warnings, two=two)
@@ -306,6 +309,11 @@ class TableEstimator:
             )
         if float(offset) >= 0:
             raise TableNotFoundError("the plane that was found is above the camera; are the poses in this camera's frame?")
+        warnings = list(warnings)
+        if problem.gravity is not None:
+            apart = math.acos(max(-1.0, min(1.0, float(-normal @ problem.gravity))))
+            if apart > 4 * math.hypot(tilt, self.config.sigma_gravity):
+                warnings.append(f"the table is {math.degrees(apart):.1f} degrees off level by the gravity that was given")
         poses = problem.measured[0] if poses is None else poses
         feet = standing_on(problem.bodies, poses, normal)
         if standing is None:

@@ -33,12 +33,12 @@ __all__ = [
 
 LEANING = math.radians(20.0)
 """What is tilted by more than this from all faces it could stand on stands on none."""
-FAR = 0.05
-"""[m]; as unlikely as standing so far above the table is leaning."""
 INDEPENDENT = 100.0
 """Matches on the table count as this many at the most: neither lenses nor tables are perfect."""
 GATE = 4.0
 """Standard deviations within which a match may be on the plane …"""
+LEAST_ON_PLANE = 50
+"""Fewer matches than this agree on some plane by chance: edges, shadows, the rim of another table."""
 NEAREST, FARTHEST = 0.05, 20.0
 """[m]; depths between which a table may be."""
 SLACK = 0.5
@@ -79,6 +79,7 @@ class PosePrior:
     config: TableConfig
     weight: float = 1.0
     nu: float = 8.0
+    cap: None = None
 
     def residual(self, x: Unknowns) -> Tensor:
         """(G, 6): along the ray, across it, rotation."""
@@ -97,7 +98,7 @@ class PosePrior:
 
 @dataclass(frozen=True, eq=False)
 class Contact:
-    """Objects stand on the table, with the feet of one face each."""
+    """Objects stand on the table, with the feet of one face each; or on something else, which is not much less likely."""
 
     feet: Feet
     owner: Tensor
@@ -105,15 +106,15 @@ class Contact:
     cost: float = 0.0
     """Of the objects that stand on nothing, so that planes can be compared by how many stand on them."""
     weight: float = 1.0
-    nu: float = 4.0
+    nu: float = math.inf
+    cap: float = 8.0
 
     @classmethod
     def of(cls, feet: Feet, sigma: float) -> "Contact":
         """All objects that do not lean too much; those that do cost as much as those that are far above."""
         owner = (feet.tilt < LEANING).nonzero()[:, 0]
-        elsewhere = 0.5 * (cls.nu + FEET) * math.log1p((FAR / sigma) ** 2 / cls.nu)
         leaning = int(feet.tilt.isfinite().sum()) - len(owner)
-        return cls(feet, owner, sigma, leaning * elsewhere)
+        return cls(feet, owner, sigma, leaning * cls.cap)
 
     def residual(self, x: Unknowns) -> Tensor:
         """(G, FEET): heights above where they belong; three of them would say all."""
@@ -134,6 +135,7 @@ class NotBelow:
     sigma: float
     weight: float = 1.0
     nu: float = 30.0
+    cap: None = None
 
     def residual(self, x: Unknowns) -> Tensor:
         """(G, 1): how deep each is."""
@@ -149,6 +151,7 @@ class CommonDepth:
     owner: None = None
     weight: float = 1.0
     nu: float = math.inf
+    cap: None = None
 
     def residual(self, x: Unknowns) -> Tensor:
         """(1, 1)."""
@@ -165,6 +168,7 @@ class Gravity:
     owner: None = None
     weight: float = 1.0
     nu: float = math.inf
+    cap: None = None
 
     def residual(self, x: Unknowns) -> Tensor:
         """(1, 2)."""
@@ -186,6 +190,7 @@ class EpipolarMatches:
     K1: Tensor
     weight: Tensor
     nu: float = 4.0
+    cap: None = None
     owner: None = None
 
     def residual(self, x: Unknowns) -> Tensor:
@@ -209,6 +214,7 @@ class PlaneMatches:
     cost: float = 0.0
     """Of the matches that cannot be on the plane, so that planes can be compared by how many are on them."""
     nu: float = 4.0
+    cap: None = None
     owner: None = None
 
     def residual(self, x: Unknowns) -> Tensor:
@@ -249,6 +255,8 @@ def plane_terms(
     on = ahead & (off[:, 0].abs() < GATE) & (shift**2 < GATE**2 * (turned[:, 1, 1] + wander + SLACK**2))
     together = torch.zeros(len(rays), dtype=torch.int64)
     weight = few(together, INDEPENDENT)
+    if int(on.sum()) < LEAST_ON_PLANE:
+        on = torch.zeros_like(on)
     elsewhere = 0.5 * (PlaneMatches.nu + 1) * math.log1p(GATE**2 / PlaneMatches.nu)
     return (
         EpipolarMatches(rays, depth, points_1, whitening[:, 0], K1, weight),
@@ -276,6 +284,7 @@ class SurfaceMatches:
     K1: Tensor
     weight: Tensor
     nu: float = 4.0
+    cap: None = None
 
     def residual(self, x: Unknowns) -> Tensor:
         """(M, 2)."""
@@ -301,6 +310,7 @@ class ModelPoints:
     K: Tensor
     weight: Tensor
     nu: float = 4.0
+    cap: None = None
 
     def residual(self, x: Unknowns) -> Tensor:
         """(M, 2)."""
@@ -323,6 +333,7 @@ class Outlines:
     K: Tensor
     weight: Tensor
     nu: float = 3.0
+    cap: None = None
 
     def residual(self, x: Unknowns) -> Tensor:
         """(M, 1)."""

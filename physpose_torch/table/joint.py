@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from physpose_torch import se3
-from physpose_torch.table.adjustment import FINE, ROUGH, Fit, State, Term, adjust
+from physpose_torch.table.adjustment import FINE, ROUGH, Fit, State, Term, adjust, unknowns_at
 from physpose_torch.table.alignment import (
     BORDER,
     CLEAR,
@@ -37,7 +37,7 @@ STANDS = 16.0
 """Squared deviation of the feet of an object that stands, in standard deviations of contacts; about three count."""
 FITS = 9.0
 """The same of a match that is where it should be."""
-HOPELESS = 100.0
+HOPELESS = 40.0
 """A plane whose cost by the poses alone is this much higher will not be the table."""
 SAME_MOTION = (math.radians(1.0), 0.1)
 """Motions that differ by less than this, in rotation [rad] and in position as a share of the baseline, end alike."""
@@ -58,7 +58,8 @@ class Solution(NamedTuple):
     rival: float
     """By how much the next best, different plane explains everything worse (difference of costs); infinite: there is none."""
     disagreement: float
-    """Squared deviation of the typical object's estimated pose, in standard deviations; 6 is the mean."""
+    """Squared deviation of the typical object from its estimate across the viewing ray, in standard deviations; 2 is the mean.
+    Images that are scaled or moved against the poses pull objects sideways."""
     two: bool
     """Whether the second view had a say."""
 
@@ -308,7 +309,8 @@ def _solution(problem: Problem, fit: Fit, terms: Sequence[Term], rival: float, t
     table, priors = None, []
     for term, squared in zip(terms, fit.surprise, strict=True):
         if isinstance(term, PosePrior):
-            priors.append(squared)
+            across = term.residual(unknowns_at(fit.state))[0, :, 1:3]
+            priors.append((across**2).sum(1))
         if isinstance(term, PlaneMatches):
             on = squared < FITS
             points_0 = term.rays[on] @ problem.views[0].K.mT

@@ -95,8 +95,8 @@ def align_patches(
         first, second = ((x.double() + 0.5) / scale - 0.5 for x in (points_0, where))
         state = _align(*images, first, second, map_, iterations, deform)
         where, map_ = (state.points + 0.5) * scale - 0.5, state.affine
-    size = where.new_tensor([image_1.shape[1] - 1, image_1.shape[0] - 1])
-    inside = ((where >= 0) & (where <= size)).all(1) & ((points_0 >= 0) & (points_0 <= size)).all(1)
+    size_0, size_1 = (where.new_tensor([x.shape[1] - 1, x.shape[0] - 1]) for x in (image_0, image_1))
+    inside = ((where >= 0) & (where <= size_1)).all(1) & ((points_0 >= 0) & (points_0 <= size_0)).all(1)
     tame = (map_ - start).abs().flatten(1).amax(1) < LARGEST_SHEAR
     good = state.good & inside & tame & (state.correlation > LEAST_CORRELATION)
     return Aligned(where, map_, state.covariance, state.correlation, good)

@@ -52,7 +52,8 @@ class View:
         if self.poses is not None:
             poses = torch.as_tensor(self.poses)
             if poses.is_floating_point() and poses.ndim == 3:
-                se3.check_rigid(poses[~poses.isnan().flatten(1).all(1)], "View.poses")
+                unseen = poses.isnan().flatten(1).all(1)[:, None, None]
+                se3.check_rigid(torch.where(unseen, torch.eye(*poses.shape[1:]).to(poses), poses), "View.poses")
             else:
                 raise InvalidInputError(
                     f"View.poses is {poses.dtype} of shape {tuple(poses.shape)}, expected floating (N, 4, 4) transforms"
@@ -95,7 +96,8 @@ def project(K: Tensor, points: Tensor) -> Tensor:
 
 def _checked_image(image: Tensor | np.ndarray) -> Tensor:
     try:
-        image = torch.as_tensor(image)
+        # torch takes no negative strides, as of an image whose channels were turned round
+        image = torch.as_tensor(np.ascontiguousarray(image) if isinstance(image, np.ndarray) else image)
     except (TypeError, ValueError):
         raise InvalidInputError(f"View.image is a {type(image).__name__}, expected (H, W, 3) uint8, RGB") from None
     if image.ndim == 2:
