@@ -222,7 +222,7 @@ def test_patches_that_look_less_and_less_alike_are_not_good():
         found = align_patches(*pair, points, there(points), affine=MAP.expand(len(points), 2, 2), deform=False)
         shares.append(float(found.good.double().mean()))
     assert shares[0] == 1.0
-    assert 0.5 < shares[1]
+    assert shares[1] > 0.5
     assert shares[2] < 0.4
 
 
