@@ -9,7 +9,8 @@ from physpose_torch import se3
 from physpose_torch.errors import InvalidInputError
 from physpose_torch.geometry.body import Body, Plane
 from physpose_torch.table import picture
-from physpose_torch.table.picture import grid_lines, table_grid, table_picture
+from physpose_torch.table.grid import grid_lines, table_grid
+from physpose_torch.table.picture import table_picture
 from physpose_torch.table.template import eroded, grown, render_template
 from physpose_torch.table.view import pixel_rays, project
 

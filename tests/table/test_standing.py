@@ -125,10 +125,18 @@ def test_the_table_under_a_pile_is_among_the_first_two_hypotheses(box, can, tabl
     assert min(abs(float(h.offset - table.plane.offset)) for h in found) < 1e-9
 
 
+def test_without_gravity_up_is_not_to_the_side_of_the_image_nor_down_in_it(table):
+    """A book on its end: what it could stand on best is beside it."""
+    book = Body.box((0.16, 0.12, 0.02), label="book")
+    best = plane_hypotheses([book], table.at(0.0, 0.0, 0.08, (0.0, math.pi / 2, 0.0))[None], CONFIG)[0]
+    assert abs(float(best.normal[0])) < 1e-6
+    assert float(best.normal[1]) < 0.5
+
+
 @pytest.mark.parametrize("below", [0.02, 0.05])
-def test_planes_that_cut_objects_are_no_good_and_planes_below_all_are_worse(can, table, below):
-    """Cans of different heights above the ground: the lowest says where it is."""
-    poses = table.poses((0.0, 0.0, 0.04), (0.1, 0.0, 0.04 + below), (-0.1, 0.0, 0.04), (0.0, 0.12, 0.04))
+def test_one_object_in_the_air_is_outvoted(can, table, below):
+    """Cans of different heights above the ground, the highest first: the others say where it is."""
+    poses = table.poses((0.1, 0.0, 0.04 + below), (0.0, 0.0, 0.04), (-0.1, 0.0, 0.04), (0.0, 0.12, 0.04))
     best = plane_hypotheses([can] * 4, poses, CONFIG, gravity=table.gravity)[0]
     assert float(best.offset) == pytest.approx(float(table.plane.offset), abs=1e-9)
 
@@ -195,6 +203,15 @@ def test_feet_are_at_the_outermost_corners(box, can, table):
     directions = feet.points[1, :, :2] / 0.03
     apart = torch.arccos((directions @ directions.mT).clamp(-1, 1)).fill_diagonal_(9).amin(1)
     assert float(apart.min()) > math.radians(20)  # all round
+
+
+def test_feet_are_below_even_where_a_body_is_wider_above(table):
+    ring = np.array([[math.cos(a), math.sin(a)] for a in np.arange(16) * math.pi / 8])
+    points = np.concatenate([np.c_[0.05 * ring, np.zeros(16)], np.c_[0.08 * ring, np.full(16, 0.06)]])
+    cup = Body.from_hull(trimesh.convex.convex_hull(points), label="cup")
+    feet = standing_on([cup], table.at()[None], table.up)
+    assert torch.allclose(feet.points[0, :, :2].norm(dim=1), torch.tensor(0.05, dtype=torch.float64))
+    assert float(feet.points[0, :, 2].abs().max()) < 1e-9
 
 
 def test_feet_that_are_not_quite_on_the_ground_know_how_high_they_are(table):

@@ -130,6 +130,12 @@ def test_what_is_out_of_sight_has_no_outline(box, where):
     assert not none.depth.any()
 
 
+def test_what_is_too_small_to_be_on_any_pixel_has_no_outline():
+    crumb = Body.box((0.001, 0.001, 0.001), label="crumb")
+    assert draw([crumb], at()).outlines == (None,)  # between four pixels
+    assert int(draw([crumb], at(0.00125, 0.00125)).outlines[0].sum()) == 1
+
+
 def test_what_is_in_sight_in_part_is_drawn_in_part(box):
     seen = draw([box], at(-0.19, 0.0, 0.5))
     assert bool(seen.outlines[0][:, 0].any())
@@ -199,7 +205,7 @@ def test_a_texture_is_interpolated_between_the_centres_of_its_pixels():
 
 def test_textures_repeat():
     picture = np.zeros((8, 8, 3), dtype=np.uint8)
-    picture[:4] = RED
+    picture[:4, :4] = RED
     plain, moved = printed_box(Image.fromarray(picture)), printed_box(Image.fromarray(picture))
     moved.appearance.visual.uv = moved.appearance.visual.uv + np.array([2.0, -3.0])
     a, b = draw([plain], at()), draw([moved], at())
