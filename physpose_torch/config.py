@@ -263,7 +263,7 @@ class TableConfig:
     """Standard deviation of an estimated rotation, per axis [rad]."""
     sigma_depth_common: float = 0.025
     """Standard deviation of the depth factor that all estimates share; only images can tell it."""
-    sigma_scale: float = 0.01
+    sigma_scale: float = 0.015
     """Standard deviation of the scale of everything that images tell: focal lengths and models are known no better. It is only
     added to what the result is said to be worth. On the two real YCB-V frames images and ground truth differ by 1 to 3 %."""
     sigma_surface: float = 0.0007

@@ -27,7 +27,7 @@ logger = logging.getLogger("physpose_torch")
 
 STILL = 1.0
 """[px]; matches that move by less than this, in the median, show no other view."""
-RIVAL = 3.0
+RIVAL = 5.0
 """Two planes whose costs differ by less than this are about as likely."""
 DISAGREE = 7.0
 """Squared deviation of the typical object from its estimate across the viewing ray, 2 in the mean if all is well; above this,
@@ -252,13 +252,18 @@ class TableEstimator:
                 f"two different planes are about as likely ({len(problem.bodies)} objects, {inliers} matches on the table); "
                 "give the direction of gravity, or a second view of a table with texture"
             )
-        if not count and inliers < FEW_MATCHES:
-            raise TableNotFoundError("no object stands on a common plane, and the images show none")
+        if not count:
+            raise TableNotFoundError(
+                f"none of {len(problem.bodies)} objects stands on the plane that explains poses and images best; are the objects "
+                "on the table, and the poses those of these images?"
+            )
         if count == 1 and inliers < FEW_MATCHES:
             warnings.append("only one object stands on the table that was found, and no image confirms it")
-        if len(problem.views) == 2 and not two:
+        elif count * 3 < len(problem.bodies):
+            warnings.append(f"only {count} of {len(problem.bodies)} objects stand on the table that was found")
+        if method == "joint" and len(problem.views) == 2 and not two:
             warnings.append("the second image does not match the first: it was left out")
-        elif len(problem.views) == 2 and inliers < FEW_MATCHES:
+        elif method == "joint" and two and inliers < FEW_MATCHES:
             warnings.append("there are hardly any matches on the table: it is known by the objects that stand on it")
         motion = state.T_view1_view0 if two else None
         scale = float(torch.linalg.vector_norm(motion[:3, 3])) if two else None

@@ -26,6 +26,7 @@ __all__ = [
     "PlaneMatches",
     "PosePrior",
     "SurfaceMatches",
+    "Upright",
     "few",
     "plane_terms",
 ]
@@ -107,7 +108,7 @@ class Contact:
     """Of the objects that stand on nothing, so that planes can be compared by how many stand on them."""
     weight: float = 1.0
     nu: float = math.inf
-    cap: float = 8.0
+    cap: float = 12.0
 
     @classmethod
     def of(cls, feet: Feet, sigma: float) -> "Contact":
@@ -171,8 +172,24 @@ class Gravity:
     cap: None = None
 
     def residual(self, x: Unknowns) -> Tensor:
-        """(1, 2)."""
-        return (x.normal @ tangent_basis(-self.down[None])[0].mT / self.sigma)[..., None, :]
+        """(1, 3): the chord, which unlike the sine goes on growing up to upside down."""
+        return ((x.normal + self.down) / self.sigma)[..., None, :]
+
+
+@dataclass(frozen=True, eq=False)
+class Upright:
+    """Where gravity is not known: cameras are mostly held upright, and look along the table or down on it."""
+
+    sigma: float
+    """Standard deviation of the sine of the roll."""
+    owner: None = None
+    weight: float = 1.0
+    nu: float = math.inf
+    cap: None = None
+
+    def residual(self, x: Unknowns) -> Tensor:
+        """(1, 1)."""
+        return (x.normal[..., 0] / self.sigma)[..., None, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,7 +229,7 @@ class PlaneMatches:
     K1: Tensor
     weight: Tensor
     cost: float = 0.0
-    """Of the matches that cannot be on the plane, so that planes can be compared by how many are on them."""
+    """What they cost if they were elsewhere, negative: planes can be compared by how many are on them."""
     nu: float = 4.0
     cap: None = None
     owner: None = None
@@ -261,7 +278,7 @@ def plane_terms(
     return (
         EpipolarMatches(rays, depth, points_1, whitening[:, 0], K1, weight),
         PlaneMatches(
-            rays[on], points_1[on], whitening[on, 1], K1, few(together[on], INDEPENDENT), elsewhere * float(weight[~on].sum())
+            rays[on], points_1[on], whitening[on, 1], K1, few(together[on], INDEPENDENT), -elsewhere * min(int(on.sum()), INDEPENDENT)
         ),
     )
 

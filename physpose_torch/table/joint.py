@@ -21,11 +21,11 @@ from physpose_torch.table.alignment import (
     predict_matches,
     surface_matches,
 )
-from physpose_torch.table.evidence import CommonDepth, Contact, Gravity, NotBelow, PlaneMatches, PosePrior
+from physpose_torch.table.evidence import CommonDepth, Contact, Gravity, NotBelow, PlaneMatches, PosePrior, Upright
 from physpose_torch.table.found import Problem
 from physpose_torch.table.lucas_kanade import align_patches, gray, sample
 from physpose_torch.table.roles import Matches
-from physpose_torch.table.standing import plane_hypotheses, standing_on
+from physpose_torch.table.standing import ROLL, plane_hypotheses, standing_on
 from physpose_torch.table.template import Template, eroded, grown, render_template
 from physpose_torch.table.two_view import motion_from_matches, motion_from_objects, triangulate
 
@@ -169,6 +169,8 @@ def _pose_terms(problem: Problem, state: State, *, two: bool) -> list[Term]:
     terms.append(CommonDepth(problem.config.sigma_depth_common))
     if problem.gravity is not None:
         terms.append(Gravity(problem.gravity, problem.config.sigma_gravity))
+    else:
+        terms.append(Upright(ROLL))
     return terms
 
 

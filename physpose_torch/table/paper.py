@@ -23,6 +23,8 @@ CONFIDENT = 0.3
 """Pixels of a reconstruction with less than this share of the median confidence are outliers."""
 MOST_POINTS = 20_000
 """Points of a dense map that the plane is fitted to."""
+LEAST_ON_PLANE = 12
+"""Fewer points than this agree on some plane by chance."""
 PLANES = 3
 """Planes that are looked for: a floor may show more than the table does."""
 
@@ -51,7 +53,7 @@ def fit_paper(
     found: list[Found] = []
     for _ in range(PLANES):
         model, info = ransac_plane(points[left], tolerance=TOLERANCE, seed=problem.config.seed)
-        if model is None or int(info.inliers.sum()) < 3:
+        if model is None or int(info.inliers.sum()) < LEAST_ON_PLANE:
             break
         normal, offset = model
         on = left[info.inliers]

@@ -13,7 +13,7 @@ from physpose_torch.config import TableConfig
 from physpose_torch.geometry.body import Body
 from physpose_torch.geometry.resting import hull_stands
 
-__all__ = ["FEET", "Feet", "Hypothesis", "plane_hypotheses", "standing_on"]
+__all__ = ["FEET", "ROLL", "Feet", "Hypothesis", "plane_hypotheses", "standing_on"]
 
 FEET = 8
 """Points a face stands on, one towards each side."""
@@ -23,7 +23,7 @@ DISTINCT = (math.radians(12.0), 0.03)
 """Planes that differ by less than this in tilt [rad] and height at the objects [m] are one hypothesis."""
 LEAST_HEIGHT = 0.05
 """[m]; the camera is at least this far above the table."""
-ROLL = 0.5
+ROLL = 0.35
 """Standard deviation of how far up in the image is from up in the world (sine of the roll), if gravity is not known."""
 
 
