@@ -254,7 +254,7 @@ class TableEstimator:
             )
         if not count:
             raise TableNotFoundError(
-                f"none of {len(problem.bodies)} objects stands on the plane that explains poses and images best; are the objects "
+                f"none of {len(problem.bodies)} objects stands on the plane that explains poses and images best; are they "
                 "on the table, and the poses those of these images?"
             )
         if count == 1 and inliers < FEW_MATCHES:

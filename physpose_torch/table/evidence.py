@@ -270,16 +270,14 @@ def plane_terms(
     wander = torch.einsum("mi,ij,mj->m", lever, plane, lever) * (length[:, 0] / state.offset) ** 2
     shift = ((where - points_1) * along).sum(1)
     on = ahead & (off[:, 0].abs() < GATE) & (shift**2 < GATE**2 * (turned[:, 1, 1] + wander + SLACK**2))
-    together = torch.zeros(len(rays), dtype=torch.int64)
-    weight = few(together, INDEPENDENT)
     if int(on.sum()) < LEAST_ON_PLANE:
         on = torch.zeros_like(on)
-    elsewhere = 0.5 * (PlaneMatches.nu + 1) * math.log1p(GATE**2 / PlaneMatches.nu)
+    together = torch.zeros(len(rays), dtype=torch.int64)
+    # by how much likelier they are on the plane than anywhere
+    cost = -0.5 * (PlaneMatches.nu + 1) * math.log1p(GATE**2 / PlaneMatches.nu) * min(int(on.sum()), INDEPENDENT)
     return (
-        EpipolarMatches(rays, depth, points_1, whitening[:, 0], K1, weight),
-        PlaneMatches(
-            rays[on], points_1[on], whitening[on, 1], K1, few(together[on], INDEPENDENT), -elsewhere * min(int(on.sum()), INDEPENDENT)
-        ),
+        EpipolarMatches(rays, depth, points_1, whitening[:, 0], K1, few(together, INDEPENDENT)),
+        PlaneMatches(rays[on], points_1[on], whitening[on, 1], K1, few(together[on], INDEPENDENT), cost),
     )
 
 
