@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import torch
 import trimesh
-from scipy.spatial import QhullError
 from torch import Tensor
 
 from physpose_torch import se3
@@ -85,11 +84,10 @@ class Body:
         """
         raw = _read_mesh(mesh, label)
         mesh = load_mesh(raw, label=label, scale=scale)
-        try:
-            corners = np.asarray(mesh.convex_hull.vertices)
-        except QhullError:
-            raise DataError(f"{label}: the mesh is flat; a body needs a volume") from None
-        parts = ConvexParts.from_hulls([corners])
+        spread = np.linalg.svd(mesh.vertices - mesh.vertices.mean(0), compute_uv=False)
+        if not spread[-1] > 1e-6 * spread[0]:  # trimesh joggles flat points into a hull
+            raise DataError(f"{label}: the mesh is flat; a body needs a volume")
+        parts = ConvexParts.from_hulls([np.asarray(mesh.convex_hull.vertices)])
         return cls(label, parts, mesh, _checked_symmetries(symmetries, label), None, _appearance(raw, scale))
 
     @classmethod
