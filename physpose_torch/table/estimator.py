@@ -185,6 +185,10 @@ class TableEstimator:
             return self._of_fit(problem, fits[0], "support", rival, None, warnings, two=False)
         problem, matches = self._usable_views(problem, warnings)
         solution = fit_joint(problem, lambda *images: matches)
+        if solution is not None and solution.two and not bool(solution.fit.standing.any()):
+            warnings.append("with the second image nothing stands on any plane: it was left out")
+            problem = problem._replace(views=problem.views[:1], measured=problem.measured[:1])
+            solution = fit_joint(problem, lambda *images: None)
         if solution is None:
             raise TableNotFoundError("no object has a shape and a pose with which it could stand on something")
         if solution.disagreement > DISAGREE:
@@ -257,8 +261,12 @@ class TableEstimator:
                 f"none of {len(problem.bodies)} objects stands on the plane that explains poses and images best; are they "
                 "on the table, and the poses those of these images?"
             )
-        if count == 1 and inliers < FEW_MATCHES:
-            warnings.append("only one object stands on the table that was found, and no image confirms it")
+        if (count == 1 or (count == 2 and problem.gravity is None)) and inliers < FEW_MATCHES:
+            # two may as well lean on a wall
+            warnings.append(
+                f"only {count} object{'s' * (count > 1)} stand{'s' * (count == 1)} on the table that was found, and no image "
+                "confirms it; the direction of gravity would"
+            )
         elif count * 3 < len(problem.bodies):
             warnings.append(f"only {count} of {len(problem.bodies)} objects stand on the table that was found")
         if method == "joint" and len(problem.views) == 2 and not two:

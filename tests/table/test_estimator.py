@@ -219,7 +219,7 @@ def test_one_box_may_stand_on_several_of_its_sides(table):
         TableEstimator(TableConfig(method="support"))(View(None, K, pose), [box])
     estimate = TableEstimator(TableConfig(method="support"))(View(None, K, pose), [box], gravity=table.gravity)
     assert float(estimate.plane.normal @ table.plane.normal) > 0.9999
-    assert any("only one object" in warning for warning in estimate.warnings)
+    assert any("only 1 object" in warning for warning in estimate.warnings)
 
 
 def test_objects_that_stand_on_nothing_in_common_give_no_table(table, box, can):
