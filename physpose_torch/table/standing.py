@@ -23,7 +23,7 @@ DISTINCT = (math.radians(12.0), 0.03)
 """Planes that differ by less than this in tilt [rad] and height at the objects [m] are one hypothesis."""
 LEAST_HEIGHT = 0.05
 """[m]; the camera is at least this far above the table."""
-ROLL = 0.35
+ROLL = 0.2
 """Standard deviation of how far up in the image is from up in the world (sine of the roll), if gravity is not known."""
 
 

@@ -297,7 +297,7 @@ def noisy(table, seed, matched):
 def test_the_covariance_is_the_scatter_of_planes(table, matched):
     """Over draws of all noise there is: poses one by one, a factor of all depths, what stands on the table, and matches."""
     off, said = [], []
-    for seed in range(150):
+    for seed in range(110):
         scene, terms = noisy(table, seed, matched)
         fit = adjust(scene.state, terms, (1.0, 1.0, 1.0))
         off.append(plane_off(fit.state, scene.state))
