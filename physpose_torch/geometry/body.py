@@ -14,7 +14,7 @@ from physpose_torch.errors import DataError, InvalidInputError
 from physpose_torch.geometry.convex import ConvexParts
 from physpose_torch.geometry.decompose import DecomposeOptions, DecomposeReport, decompose
 
-__all__ = ["Body", "Plane", "load_mesh"]
+__all__ = ["Body", "Plane", "is_flat", "load_mesh"]
 
 CYLINDER_SIDES = 32
 
@@ -84,8 +84,7 @@ class Body:
         """
         raw = _read_mesh(mesh, label)
         mesh = load_mesh(raw, label=label, scale=scale)
-        spread = np.linalg.svd(mesh.vertices - mesh.vertices.mean(0), compute_uv=False)
-        if not spread[-1] > 1e-6 * spread[0]:  # trimesh joggles flat points into a hull
+        if is_flat(mesh):
             raise DataError(f"{label}: the mesh is flat; a body needs a volume")
         parts = ConvexParts.from_hulls([np.asarray(mesh.convex_hull.vertices)])
         return cls(label, parts, mesh, _checked_symmetries(symmetries, label), None, _appearance(raw, scale))
@@ -232,6 +231,12 @@ def _appearance(mesh: trimesh.Trimesh, scale: float) -> trimesh.Trimesh | None:
         if visual.uv is None or image is None or len(visual.uv) != len(mesh.vertices):
             return None
     return trimesh.Trimesh(np.asarray(mesh.vertices) * scale, mesh.faces, visual=visual.copy(), process=False)
+
+
+def is_flat(mesh: trimesh.Trimesh) -> bool:
+    """Whether a mesh has no extent in some direction; trimesh would joggle its points into a hull."""
+    spread = np.linalg.svd(mesh.vertices - mesh.vertices.mean(0), compute_uv=False)
+    return not spread[-1] > 1e-6 * spread[0]
 
 
 def _is_covariance(matrix: Tensor) -> bool:

@@ -8,10 +8,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import trimesh
-from scipy.spatial import QhullError
 from torch import Tensor
 
-from physpose_torch.geometry.body import Body
+from physpose_torch.geometry.body import Body, is_flat
 
 __all__ = ["HullStands", "NearestRest", "RestingPoses", "hull_stands", "nearest_rest", "resting_poses"]
 
@@ -79,10 +78,9 @@ def nearest_rest(bodies: Sequence[Body], up: Tensor) -> NearestRest:
 @lru_cache(maxsize=256)
 def hull_stands(body: Body) -> HullStands | None:
     """On which faces of its convex hull a body can stand, if only for a moment; None if it is flat, or a line."""
-    try:
-        hull = trimesh.Trimesh(body.mesh.vertices, body.mesh.faces, process=False).convex_hull
-    except QhullError:
+    if is_flat(body.mesh):
         return None
+    hull = trimesh.Trimesh(body.mesh.vertices, body.mesh.faces, process=False).convex_hull
     center = body.center_of_mass.numpy()
     triangles, normals = np.asarray(hull.triangles), np.asarray(hull.face_normals)
     depth = ((triangles[:, 0] - center) * normals).sum(1)
