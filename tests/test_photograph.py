@@ -1,6 +1,5 @@
 """The generated photographs show what their ground truth says, to a twentieth of a pixel, and nothing impossible."""
 
-import time
 from functools import cache
 
 import numpy as np
@@ -13,6 +12,8 @@ from physpose_torch.errors import InvalidInputError
 from physpose_torch.household import HOUSEHOLD_COLORS, household_meshes
 from physpose_torch.photograph import TABLES, household_pair
 from physpose_torch.render import render
+
+pytestmark = pytest.mark.slow  # half a minute of rendering each; the estimator's tests render some, too
 
 SHAPES = household_meshes()
 WELL = 0.004  # of the plate: what stands on it stands so far above the table [m]
@@ -298,13 +299,6 @@ def test_meshes_are_the_household_shapes_with_colours_two_millimetres_apart(name
     assert mesh.visual.kind == "vertex"
     other, _ = printed.coloured(name, np.random.default_rng(1))
     assert not np.array_equal(mesh.visual.vertex_colors, other.visual.vertex_colors)
-
-
-def test_a_pair_takes_seconds():
-    pair(1, table="wood")
-    started = time.perf_counter()
-    household_pair(0)
-    assert time.perf_counter() - started < 12  # 3.3 s on one thread of a quiet machine
 
 
 @pytest.mark.parametrize(

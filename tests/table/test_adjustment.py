@@ -20,6 +20,7 @@ from physpose_torch.table.adjustment import (
     Unknowns,
     _moved,
     _normal_equations,
+    _unknowns,
     adjust,
     unknowns_at,
 )
@@ -363,14 +364,30 @@ def test_scales_from_far_to_one_find_what_scale_one_does_not(scene):
     assert sum(plain) > sum(graduated)
 
 
-def test_cost_covariance_and_surprise_are_at_scale_one_whatever_the_schedule_was(scene):
+def test_cost_and_covariance_are_at_scale_one_whatever_the_schedule_was(table):
+    """With noise: without it, weights are the same at all scales."""
+    scene, terms = noisy(table, 0, True)
     start = scene.start(shift=0.002, turn=0.005)
-    a, b = (adjust(start, scene.some(*ALL), s) for s in (ROUGH, FINE))
-    assert a.cost == pytest.approx(b.cost, rel=1e-6)
-    torch.testing.assert_close(a.covariance, b.covariance, rtol=1e-4, atol=0)
-    still = adjust(start, scene.some(*ALL), ())
+    still = adjust(start, terms, ())
     assert_states_agree(still.state, start, 0.0)
+    matrix, _, cost, _ = _normal_equations(start, terms, 1.0)
+    assert still.cost == pytest.approx(cost)
+    torch.testing.assert_close(still.covariance, torch.linalg.inv(matrix)[6:9, 6:9])
+    a, b = (adjust(start, terms, s + (1.0,) * 12) for s in (ROUGH, FINE))
+    assert a.cost == pytest.approx(b.cost, rel=1e-6)
+    torch.testing.assert_close(a.covariance, b.covariance, rtol=1e-3, atol=0)
     assert still.cost > a.cost
+
+
+def test_a_step_leads_to_the_same_plane_whether_it_is_tried_or_taken(scene):
+    for seed in range(4):
+        step = torch.cat([torch.zeros(6), 0.2 * normal(3, seed=seed), torch.zeros(7)]).double()
+        tried = _unknowns(scene.state, step[None])
+        taken = _moved(scene.state, torch.cat([step[:SHARED], torch.zeros(24, dtype=torch.float64)]))
+        length = tried.normal[0].norm()
+        assert float(length) > 1.001
+        torch.testing.assert_close(taken.normal, tried.normal[0] / length)
+        torch.testing.assert_close(taken.offset, tried.offset[0] / length)
 
 
 def test_an_unknown_that_nothing_holds_stays_where_it_is(scene):

@@ -56,6 +56,7 @@ def test_a_bare_table_is_found_by_what_stands_on_it(plain):
     assert abs(height) < 5.0
 
 
+@pytest.mark.slow
 def test_a_common_bias_of_depth_does_not_move_the_table(wood):
     biased = []
     for view in (0, 1):
@@ -88,6 +89,7 @@ def test_poses_alone_tell_a_table_within_what_they_say_they_know(wood):
     assert estimate.sigma_offset > 5e-3
 
 
+@pytest.mark.slow
 def test_a_second_view_needs_no_poses(wood):
     estimate = TableEstimator(SIFT)([wood.view(0), wood.view(1, poses=None)], wood.bodies)
     angle, height = wood.errors(estimate.plane)
@@ -149,6 +151,7 @@ def test_gravity_draws_the_table_level(plain):
     assert known.sigma_tilt < 0.5 * without.sigma_tilt
 
 
+@pytest.mark.slow
 def test_gravity_that_contradicts_everything_is_told(wood):
     tilted = torch.nn.functional.normalize(-wood.pair.normal + 0.3 * tangent_basis(wood.pair.normal[None])[0, 0], dim=0)
     estimate = TableEstimator(SIFT)(wood.views, wood.bodies, gravity=tilted)
@@ -162,6 +165,7 @@ def test_the_callers_dtype_comes_back(wood, dtype):
     assert estimate.plane.normal.dtype == estimate.plane.covariance.dtype == estimate.poses.dtype == dtype
 
 
+@pytest.mark.slow
 def test_the_same_twice_is_the_same(wood):
     first, second = (TableEstimator(SIFT)(wood.views, wood.bodies).plane for _ in range(2))
     assert torch.equal(first.normal, second.normal)
@@ -267,6 +271,7 @@ def test_options_out_of_range_are_named(name, value):
         TableConfig(**{name: value})
 
 
+@pytest.mark.slow
 def test_models_of_the_user_find_the_matches(wood):
     asked = []
 
