@@ -338,6 +338,20 @@ def test_matches_that_are_wrong_move_nothing(scene):
     assert float(fit.surprise[3][10:].max()) < 30
 
 
+@pytest.mark.parametrize("lift", [0.04, 0.06, 0.09, 0.15])
+def test_an_object_that_is_estimated_to_stand_elsewhere_is_not_pulled_in(scene, lift):
+    """It is held above the table, which matches know; that the others were off instead would be far less likely."""
+    lifted = scene.state.poses.clone()
+    lifted[1, :3, 3] += lift * scene.state.normal
+    scene.change("prior 0", measured=lifted)
+    scene.change("prior 1", measured=MOTION @ lifted)
+    names = ("prior 0", "prior 1", "contact", "below", "depth", "epipolar", "plane")
+    fit = adjust(scene.state._replace(poses=lifted), scene.some(*names), ROUGH + FINE)
+    assert float(plane_off(fit.state, scene.state).abs().max()) < 5e-4
+    torch.testing.assert_close(fit.state.poses[1], lifted[1], atol=2e-3, rtol=0)
+    assert (fit.surprise[2] < 16).tolist() == [True, False, True, True]
+
+
 def test_an_object_whose_pose_is_wrong_in_one_view_moves_little(scene):
     """Its colours and contact say otherwise."""
     wrong = scene.state.poses.clone()
