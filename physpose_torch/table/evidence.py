@@ -88,7 +88,8 @@ class PosePrior:
         measured = _turned(self.measured[:, :3, :3], self.center) + self.measured[:, :3, 3]
         distance = torch.linalg.vector_norm(measured, dim=1, keepdim=True)
         ray = measured / distance
-        off = _turned(R, self.center) + t[..., 0] - x.depth_factor[..., None, None] * measured
+        # divided, not the estimates multiplied: residuals must not shrink with the scene
+        off = (_turned(R, self.center) + t[..., 0]) / x.depth_factor[..., None, None] - measured
         along = (off * ray).sum(-1, keepdim=True) / (self.config.sigma_ray_fraction * distance)
         across = (tangent_basis(ray) @ off[..., None])[..., 0] / self.config.sigma_lateral
         turn = self.measured[:, :3, :3].mT @ R

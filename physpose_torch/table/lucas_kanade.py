@@ -56,6 +56,12 @@ def gray(image: Tensor) -> Tensor:
 
 def sample(image: Tensor, points: Tensor, mode: str = "bilinear") -> Tensor:
     """Values (...) of an image (H, W) at points (..., 2) [px], pixel centres at integers; the border goes on outside."""
+    if mode == "bicubic":  # torch's kernel (A = -0.75) puts a ramp at t + t (1 - t) (1 - 2 t) / 2
+        low = points.floor()
+        wanted = part = points - low
+        for _ in range(4):
+            part = wanted - 0.5 * part * (1 - part) * (1 - 2 * part)
+        points = low + part
     size = points.new_tensor([image.shape[1] - 1, image.shape[0] - 1])
     grid = (2.0 * points / size - 1.0).to(image.dtype).reshape(1, 1, -1, 2)
     value = grid_sample(image[None, None], grid, mode=mode, padding_mode="border", align_corners=True)

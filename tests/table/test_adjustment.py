@@ -589,3 +589,18 @@ def test_the_more_is_on_a_plane_the_less_it_costs(scene):
     assert many.cost < some.cost < 0
     assert Planes(scene, count=40).terms(scene)[1].cost == 0.0
     assert Planes(scene, count=400).terms(scene)[1].cost == pytest.approx(Planes(scene, count=900).terms(scene)[1].cost)
+
+
+def test_noise_of_poses_does_not_shrink_the_scene(table):
+    """Nothing but poses in two views, of seven objects: the common factor is 1 in the mean."""
+    factors = []
+    for seed in range(30):
+        poses = table.poses(*((*xy, 0.02) for xy in (0.25 * uniform(7, 2, seed=seed)).tolist()))
+        one, rows = torch.ones((), dtype=torch.float64), torch.arange(7)
+        state = State(MOTION, poses, table.up, table.plane.offset, one, poses[:, :3, 3].mean(0))
+        terms = [CommonDepth(CONFIG.sigma_depth_common)]
+        for view, T in ((0, poses), (1, MOTION @ poses)):
+            measured = se3.retract(T, pose_noise(T, 2 * seed + view))
+            terms.append(PosePrior(view, measured, torch.zeros(7, 3, dtype=torch.float64), rows, CONFIG))
+        factors.append(float(adjust(state, terms, (1.0,) * 6).state.depth_factor))
+    assert abs(sum(factors) / 30 - 1) < 0.003

@@ -266,3 +266,19 @@ def test_luma_weighs_the_channels_and_samples_are_at_pixel_centres():
     points = torch.tensor([[2.0, 3.0], [2.5, 3.0], [2.0, 3.25], [-5.0, 1.0], [6.0, 4.0]], dtype=torch.float64)
     assert sample(ramp, points).tolist() == pytest.approx([11.0, 11.5, 11.75, 3.0, 18.0], abs=1e-4)
     assert sample(ramp, points.reshape(5, 1, 2)).shape == (5, 1)
+
+
+@pytest.mark.parametrize("part", [0.0, 0.3, 0.5, 0.8])
+def test_without_noise_patches_are_found_to_two_hundredths_of_a_pixel_wherever_they_are(part):
+    """No pull towards pixel centres, nor away from them."""
+    points = grid() - 0.3 + part
+    found = align_patches(*images(Texture(), map_=EXACT), points, there(points, EXACT), deform=False)
+    assert bool(found.good.all())
+    assert float((found.points - there(points, EXACT)).abs().median()) < 0.02
+
+
+def test_bicubic_samples_of_a_ramp_are_on_the_ramp():
+    ramp = 3.0 * torch.arange(12.0)[:, None] + torch.arange(15.0)
+    points = 4 + 4 * torch.rand(50, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    expected = points @ points.new_tensor([1.0, 3.0])
+    torch.testing.assert_close(sample(ramp, points, "bicubic").double(), expected, atol=0.01, rtol=0)
