@@ -458,7 +458,8 @@ def test_trajectories_and_callbacks_agree(household, general):
 
 def test_hypotheses_agree(household, general):
     poses, scene = household
-    many = torch.stack([poses, shaken(poses, 1), shaken(poses, 2)])[None]
+    # not seed 1: it puts one object within 1e-11 of a tie between smoothing samples, where rounding, and so the machine, decides
+    many = torch.stack([poses, shaken(poses, 3), shaken(poses, 4)])[None]
     refiner = PhysPoseRefiner(RefinerConfig(steps=6))
     together = refiner(many, scene)
     assert_same_refinement(together, general(refiner, many, scene))
