@@ -21,8 +21,6 @@ ROUGH = (8.0, 8.0, 6.0, 4.0, 3.0, 2.0, 1.5, 1.0, 1.0, 1.0)
 """Scales of the weights from a rough start, one a step."""
 FINE = (3.0, 2.0, 1.5, 1.0, 1.0, 1.0)
 """The same from a good one."""
-WIDEST = 3.0
-"""Largest scale for terms with a cap: seen from farther, what is truly elsewhere would be pulled in and stay."""
 SHARED = 10
 """Unknowns that all rows may see: second camera (6), plane (3), depth factor (1); then six of the row's own object."""
 RIDGE = (1.0, 1e-4, 1.0)
@@ -186,8 +184,9 @@ def _normal_equations(state: State, terms: Sequence[Term], scale: float):
 def _robust(squared: Tensor, dimensions: int, term: Term, scale: float) -> tuple[Tensor, Tensor]:
     """Weights at a scale, and losses at scale one, of rows with these squared lengths."""
     if term.cap is not None:
-        limit, scale = 2.0 * term.cap, min(scale, WIDEST)
-        return (limit / (limit + squared / scale**2)) ** 2, 0.5 * squared * limit / (limit + squared)
+        # at scale one from the start: seen from farther, what is truly elsewhere would be pulled in and stay
+        limit = 2.0 * term.cap
+        return (limit / (limit + squared)) ** 2, 0.5 * squared * limit / (limit + squared)
     if term.nu == float("inf"):
         return torch.ones_like(squared), 0.5 * squared
     weight = (term.nu + dimensions) / (term.nu + squared / scale**2)

@@ -94,7 +94,7 @@ def located_matches(
         raise TableNotFoundError(f"method {problem.config.method!r} needs two images; use 'support' or 'auto' for one")
     matches = Located.of(find_matches(*(v.image for v in views)), [gray(v.image) for v in views])
     plain = Matches(matches.points_0, matches.points_1, torch.ones(len(matches.points_0)))
-    motion, _ = motion_from_matches(plain, views[0].K, views[1].K, seed=problem.config.seed)
+    motion, _ = motion_from_matches(plain, views[0].K, views[1].K)
     by_objects = motion_from_objects(*problem.measured)
     if (motion is None or len(matches.points_0) < LEAST_ON_OBJECTS) and by_objects is not None:
         motion = by_objects

@@ -235,7 +235,7 @@ def _motions(problem: Problem, by_objects: Tensor | None, matches: Located | Non
         return motions
     K0, K1 = (v.K for v in problem.views)
     plain = Matches(matches.points_0, matches.points_1, torch.ones(len(matches.points_0)))
-    unit, info = motion_from_matches(plain, K0, K1, seed=problem.config.seed)
+    unit, info = motion_from_matches(plain, K0, K1)
     if unit is None:
         return motions
     # how long the baseline is, only objects can tell

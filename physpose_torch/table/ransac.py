@@ -101,6 +101,8 @@ def ransac_scale(
         raise InvalidInputError(
             f"target is {tuple(target.shape)}, owner {tuple(owner.shape)}, expected {tuple(source.shape)} and one a point"
         )
+    if not bool(target.isfinite().all()):
+        raise InvalidInputError("target contains NaN or infinity; leave these points out")
     source, target = source.double(), target.double()
     first, second = _pairs(owner, samples, seed)
     from_, to = ((x[first] - x[second]).norm(dim=1) for x in (source, target))

@@ -39,10 +39,10 @@ def motion_from_objects(first: Tensor, second: Tensor) -> Tensor | None:
     return se3.from_rotation_translation(R, shift[agree].median(0)[0] if int(agree.sum()) > 2 else shift[agree].mean(0))
 
 
-def motion_from_matches(
-    matches: Matches, K0: Tensor, K1: Tensor, *, seed: int = 0
-) -> tuple[Tensor | None, RansacInfo]:
+def motion_from_matches(matches: Matches, K0: Tensor, K1: Tensor) -> tuple[Tensor | None, RansacInfo]:
     """T_view1_view0 (4, 4) with a translation of length 1, from an essential matrix (Nistér's five points, MAGSAC++).
+
+    The same matches give the same motion: OpenCV's USAC draws from a generator of its own with a fixed seed.
 
     Returns:
         The motion, None where there is none to be found; and which matches agree with it.
@@ -51,7 +51,6 @@ def motion_from_matches(
     nothing = RansacInfo(torch.zeros(count, dtype=torch.bool), torch.full((count,), torch.inf), 0)
     if count < LEAST_MATCHES:
         return None, nothing
-    cv2.setRNGSeed(seed)
     rays = [pixel_rays(K, p)[:, :2].numpy() for K, p in ((K0, matches.points_0), (K1, matches.points_1))]
     focal = float((K0[0, 0] + K0[1, 1] + K1[0, 0] + K1[1, 1]) / 4)
     found, mask = cv2.findEssentialMat(

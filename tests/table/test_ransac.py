@@ -168,6 +168,14 @@ def test_an_exact_scale_is_exact():
     assert info.samples == 1000
 
 
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_points_without_a_depth_are_refused(value):
+    objects = Objects()
+    objects.target[7, 2] = value
+    with pytest.raises(InvalidInputError, match="target contains NaN or infinity"):
+        objects.find()
+
+
 def test_objects_at_wrong_depths_do_no_harm():
     """Each object is moved along its ray by 3 %: ratios of depths would be off, distances on each object are not."""
     objects = Objects()
