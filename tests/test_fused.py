@@ -458,7 +458,7 @@ def test_trajectories_and_callbacks_agree(household, general):
 
 def test_hypotheses_agree(household, general):
     poses, scene = household
-    # not seed 1: it puts one object within 1e-11 of a tie between smoothing samples, where rounding, and so the machine, decides
+    # not seed 1: it puts an object within 1e-11 of a tie between smoothing samples, where the machine's rounding decides
     many = torch.stack([poses, shaken(poses, 3), shaken(poses, 4)])[None]
     refiner = PhysPoseRefiner(RefinerConfig(steps=6))
     together = refiner(many, scene)
