@@ -174,6 +174,9 @@ class RefinerConfig:
     """An image stops when none of its objects moved by more than this [m] in a step, for ten steps on end."""
     keep_trajectory: bool = False
     """Keep the poses of every step in the result."""
+    gradient: Literal["none", "implicit"] = "none"
+    """``implicit``: the refined poses carry gradients towards the estimates, by the implicit function theorem at the poses where
+    the refinement ended, whatever the solver. ``none``: they are detached."""
 
     def __post_init__(self) -> None:
         _check_positive(self, "learning_rate", "max_step", "damping")
@@ -190,6 +193,8 @@ class RefinerConfig:
                 f"RefinerConfig.optimizer = {self.optimizer!r}, decay = {self.decay!r}: "
                 "expected 'adam' or 'sgd', and 'cosine' or 'none'"
             )
+        if self.gradient not in ("none", "implicit"):
+            raise InvalidInputError(f"RefinerConfig.gradient = {self.gradient!r}, expected 'none' or 'implicit'")
         if self.max_gradient is not None:
             _check_positive(self, "max_gradient")
         if not self.tolerance >= 0:

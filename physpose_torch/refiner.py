@@ -9,11 +9,12 @@ from torch import Tensor, nn
 
 from physpose_torch.config import RefinerConfig
 from physpose_torch.errors import InvalidInputError
+from physpose_torch.implicit import Solution, attach
 from physpose_torch.losses import PhysicsLoss, PhysicsTerms, acting, check_poses, flatten_covariance
 from physpose_torch.prior import make_prior
 from physpose_torch.report import PhysicsReport, report_of
 from physpose_torch.righting import right_fallen
-from physpose_torch.scene import Scene
+from physpose_torch.scene import Scene, as_matrix
 from physpose_torch.solvers.descent import descend
 from physpose_torch.solvers.lm import levenberg_marquardt
 
@@ -99,6 +100,7 @@ class PhysPoseRefiner(nn.Module):
         Raises:
             InvalidInputError: shapes, NaN or non-rigid poses, a covariance that is not positive definite.
         """
+        poses = as_matrix(poses)
         check_poses(poses, scene)
         _check_metres(poses, scene)
         leading = poses.shape[:-3]
@@ -145,8 +147,12 @@ class PhysPoseRefiner(nn.Module):
         if trajectory is not None:
             trajectory = trajectory.reshape(len(trajectory), *measured.shape).to(poses.dtype)
             trajectory[0] = poses.detach()  # the descent begins where the depth bias is removed
+        refined = refined.to(poses.dtype)
+        if self.config.gradient == "implicit" and poses.requires_grad and torch.is_grad_enabled():
+            solution = Solution(result.poses, many, acts, covariance, righted, self.config)
+            refined = attach(poses.reshape(-1, 4, 4), solution).reshape(poses.shape)
         return Refinement(
-            poses=refined.to(poses.dtype),
+            poses=refined,
             report=report,
             terms=PhysicsTerms(*(x.to(poses.dtype) for x in terms)),
             trajectory=trajectory,
