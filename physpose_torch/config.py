@@ -175,8 +175,8 @@ class RefinerConfig:
     keep_trajectory: bool = False
     """Keep the poses of every step in the result."""
     gradient: Literal["none", "implicit"] = "none"
-    """``implicit``: the refined poses carry gradients towards the estimates, by the implicit function theorem at the poses where
-    the refinement ended, whatever the solver. ``none``: they are detached."""
+    """``implicit``: the refined poses carry gradients towards the estimates, by the implicit function theorem at the poses
+    where the refinement ended, whatever the solver. ``none``: they are detached."""
 
     def __post_init__(self) -> None:
         _check_positive(self, "learning_rate", "max_step", "damping")
