@@ -27,6 +27,7 @@ _HOMES = {
     "losses": ["PhysicsLoss", "PhysicsTerms", "collision_loss", "gravity_loss", "pose_covariance", "pose_loss"],
     "report": ["PhysicsReport", "physics_report"],
     "refiner": ["PhysPoseRefiner", "Refinement"],
+    "robot.environment": ["RobotEnvironment", "RobotState"],
     "table.view": ["View"],
     "table.estimator": ["TableEstimate", "TableEstimator"],
 }

@@ -80,7 +80,7 @@ def find_contacts(
     moves_first, moves_second = _moves(first, second, acts, n)
     distance = signed_distance(
         _gather(T, first, moves_first),
-        _gather(T, second, moves_second),
+        _gather(T, second, moves_second | (second >= n)),  # a static's pose may ask for gradients
         scene.parts,
         scene.instance_part[pairs],
         smoothing=smoothing,
@@ -137,7 +137,7 @@ def find_drops(
     who_plane = entity[instance]
     above = _above_planes(T, scene, instance, plane, smoothing)
     down = gravity[scene.image[who_plane].to(device)]
-    slope = -(scene.plane_normal.to(poses)[plane].detach() * down).sum(-1)
+    slope = -(scene.plane_normal.to(poses)[plane] * down).sum(-1)
     above = torch.where(slope >= SUPPORT_SLOPE, above.clamp_min(0.0) / slope.clamp_min(SUPPORT_SLOPE), torch.inf)
     above = torch.where(above <= reach, above, torch.inf)
 

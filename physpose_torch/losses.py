@@ -10,7 +10,7 @@ from physpose_torch.config import PhysicsConfig
 from physpose_torch.contacts import Contacts, Drops, find_contacts, find_drops, find_static_gaps
 from physpose_torch.errors import InvalidInputError
 from physpose_torch.prior import PosePrior, common_depth, make_prior, pose_covariance
-from physpose_torch.scene import Scene
+from physpose_torch.scene import Scene, as_matrix
 
 __all__ = [
     "PhysicsLoss",
@@ -174,9 +174,25 @@ class PhysicsLoss(nn.Module):
             scores: (N,) confidence of the estimates; among alternatives of one object the best one acts on the scene,
                 the others feel it and push nobody. None: the first one.
 
+        Which parts are near each other decides every shape in here, so ``torch.compile`` breaks the graph once, at this call,
+        and runs it as it is; what is before and after it is compiled.
+
         Raises:
             InvalidInputError: shapes, NaN, non-rigid poses, or a covariance that is not positive definite.
         """
+        if torch.compiler.is_compiling():
+            # one break instead of one at every shape that depends on data, and no new graph for every number of contacts
+            return torch.compiler.disable(self._terms)(poses, scene, measured, measured_covariance, scores)
+        return self._terms(poses, scene, measured, measured_covariance, scores)
+
+    def _terms(
+        self,
+        poses: Tensor,
+        scene: Scene,
+        measured: Tensor | None,
+        measured_covariance: Tensor | None,
+        scores: Tensor | None,
+    ) -> PhysicsTerms:
         poses = check_poses(poses, scene)
         leading = poses.shape[:-3]
         hypotheses = leading.numel()
@@ -255,12 +271,27 @@ def acting(scene: Scene, scores: Tensor | None) -> Tensor:
 
 
 def check_poses(poses: Tensor, scene: Scene, name: str = "poses") -> Tensor:
-    se3.check_rigid(poses, name, scene.labels or None)
+    """Poses (..., N, 4, 4) that fit the scene, in a dtype to compute in; the matrices of a ``Transform3d``."""
+    poses = as_matrix(poses)
+    try:
+        se3.check_rigid(poses, name, scene.labels or None)
+    except InvalidInputError as error:
+        if isinstance(poses, Tensor) and _in_half_precision(poses):
+            raise InvalidInputError(
+                f"{error}. Autocast rounds products of matrices to half precision: put poses together in float32, inside "
+                "torch.autocast(device_type, enabled=False)"
+            ) from error
+        raise
     if poses.ndim < 3 or poses.shape[-3] != len(scene):
         raise InvalidInputError(
             f"{name} has shape {tuple(poses.shape)}, expected (..., {len(scene)}, 4, 4) for a scene of {len(scene)} objects"
         )
     return poses if poses.dtype in (torch.float32, torch.float64) else poses.float()
+
+
+def _in_half_precision(poses: Tensor) -> bool:
+    """Whether that may be why rotations are not rigid: bfloat16 is off by up to 0.4 %."""
+    return poses.dtype in (torch.float16, torch.bfloat16) or torch.is_autocast_enabled(poses.device.type)
 
 
 def flatten_covariance(covariance: Tensor | None, poses: Tensor) -> Tensor | None:

@@ -22,7 +22,8 @@ from physpose_torch.render import fragments, render
 if TYPE_CHECKING:
     import trimesh
 
-    from physpose_torch.viz import _Scene, _Shadows
+    from physpose_torch.viz.scene import PlacedScene
+    from physpose_torch.viz.shading import Shadows
 
 __all__ = ["TABLES", "HouseholdPair", "household_pair"]
 
@@ -246,17 +247,17 @@ def _look_up(texture: Tensor, uv: Tensor, texels: Tensor) -> Tensor:
     return out
 
 
-def _light(points: Tensor, normals: Tensor, shadows: "_Shadows") -> Tensor:
+def _light(points: Tensor, normals: Tensor, shadows: "Shadows") -> Tensor:
     """Light (M,) that reaches matt surface: a soft sun, more from above than from below, less near the table."""
-    from physpose_torch.viz import _LIGHT
+    from physpose_torch.viz.shading import LIGHT
 
-    sun = (normals @ _LIGHT.float()).clamp(min=0)
+    sun = (normals @ LIGHT.float()).clamp(min=0)
     sun = sun * shadows.lit(points + 0.003 * normals)
     corner = 1 - 0.45 * torch.exp(-points[:, 2].clamp(min=0) / 0.012).float() * (1 - normals[:, 2].clamp(min=0))
     return (0.42 + 0.10 * normals[:, 2]) * corner + 0.56 * sun
 
 
-def _lit_table(top: np.ndarray, centre: np.ndarray, shadows: "_Shadows") -> Tensor:
+def _lit_table(top: np.ndarray, centre: np.ndarray, shadows: "Shadows") -> Tensor:
     """The table's reflectance times its light: both views see the same, for it is matt."""
     from scipy.ndimage import gaussian_filter
 
@@ -287,12 +288,13 @@ def _photograph(
     import trimesh
     from scipy.ndimage import gaussian_filter
 
-    from physpose_torch.viz import _place, _Shadows
+    from physpose_torch.viz.scene import place
+    from physpose_torch.viz.shading import Shadows
 
     top, floor, centre = ground
     coarse = [tuple(map(torch.from_numpy, _shapes()[n])) for n in names]
     blank = [torch.zeros(len(f), 3, 3, dtype=torch.float64) for _, f in coarse]
-    shadows = _Shadows(_place([(*c, b, b) for c, b in zip(coarse, blank, strict=True)], T_table_object))
+    shadows = Shadows(place([(*c, b, b) for c, b in zip(coarse, blank, strict=True)], T_table_object))
     lit_top = _lit_table(top, centre, shadows)
     slab = trimesh.creation.box(bounds=[[*(centre - TOP_SIZE / 2), -_THICK], [*(centre + TOP_SIZE / 2), 0]])
     sides = np.abs(slab.face_normals[:, 2]) < 0.5
@@ -300,7 +302,7 @@ def _photograph(
     rim = (slab.vertices, slab.faces[sides], np.repeat(slab.face_normals[sides][:, None], 3, 1), paint)
     rim = tuple(torch.from_numpy(np.array(a)) for a in rim)
     poses = torch.cat([T_table_object, torch.eye(4, dtype=torch.float64)[None]])
-    scene = _place([*surfaces, rim], poses)
+    scene = place([*surfaces, rim], poses)
     images = []
     for k, T in enumerate(cameras):
         image = _expose(scene, torch.from_numpy(T), K, height, width, lit_top, torch.from_numpy(floor), centre, shadows)
@@ -312,7 +314,7 @@ def _photograph(
 
 
 def _expose(
-    scene: "_Scene",
+    scene: "PlacedScene",
     T: Tensor,
     K: Tensor,
     height: int,
@@ -320,16 +322,16 @@ def _expose(
     top: Tensor,
     floor: Tensor,
     centre: np.ndarray,
-    shadows: "_Shadows",
+    shadows: "Shadows",
 ) -> Tensor:
     """Linear image (H, W, 3), the mean of `_SUPER`² samples a pixel."""
-    from physpose_torch.viz import _View
+    from physpose_torch.viz.scene import SceneView
 
     s = _SUPER
     K = (
         torch.tensor([[s, 0, (s - 1) / 2], [0, s, (s - 1) / 2], [0, 0, 1]], dtype=torch.float64) @ K
     )  # x + (k + ½)/s - ½
-    view = _View(T, K, height * s, width * s)
+    view = SceneView(T, K, height * s, width * s)
     eye, rays = view.rays()
     a, b, c = scene.vertices[scene.faces].unbind(1)
     front = ((torch.linalg.cross(b - a, c - a) * (a - eye)).sum(1) < 0).nonzero()[:, 0]

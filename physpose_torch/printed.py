@@ -46,10 +46,10 @@ def _fine(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     import trimesh
 
-    from physpose_torch.viz import _corner_normals
+    from physpose_torch.viz.scene import corner_normals
 
     vertices, faces = _shapes()[name]
-    normals = _corner_normals(trimesh.Trimesh(vertices, faces, process=False))
+    normals = corner_normals(trimesh.Trimesh(vertices, faces, process=False))
     while True:
         ends = np.sort(np.stack([faces, np.roll(faces, -1, 1)], 2), 2)
         long = np.linalg.norm(vertices[ends[..., 0]] - vertices[ends[..., 1]], axis=2) > _EDGE

@@ -116,7 +116,7 @@ def _leans(poses: Tensor, scene: Scene, acts: Tensor, falls: Tensor, backend: st
     leans[who[beside & above]] = True
     normal, offset = scene.plane_normal.to(poses), scene.plane_offset.to(poses)
     for i, plane in scene.plane_pairs.tolist():
-        if bool(falls[i]) and abs(float(normal[plane] @ down[i])) < SUPPORT_SLOPE:
+        if bool(falls[i]) and abs(float((normal[plane] @ down[i]).detach())) < SUPPORT_SLOPE:
             corners = se3.apply(poses[i], scene.objects[i].parts.vertices.to(poses))
             beside = corners @ normal[plane] - offset[plane] <= TOLERANCE
             leans[i] |= bool((beside & ((corners - mass[i]) @ down[i] < 0)).any())

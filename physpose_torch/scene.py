@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,7 +14,22 @@ from physpose_torch.errors import InvalidInputError
 from physpose_torch.geometry.body import Body, Plane
 from physpose_torch.geometry.convex import ConvexParts
 
-__all__ = ["Scene", "Static"]
+__all__ = ["Scene", "Static", "as_matrix"]
+
+
+def as_matrix(T: Any, *, single: bool = False) -> Any:
+    """The 4×4 matrices of a ``Transform3d`` of pytorch-kinematics or PyTorch3D; everything else comes back as it is.
+
+    Whatever has a ``get_matrix`` counts, so neither library is imported.
+
+    Args:
+        T: a ``Transform3d``, whose matrices are (B, 4, 4), or a tensor of transforms.
+        single: take a batch of one as one transform, (4, 4).
+    """
+    if isinstance(T, Tensor) or not callable(getattr(T, "get_matrix", None)):
+        return T
+    T = T.get_matrix()
+    return T[0] if single and T.ndim == 3 and len(T) == 1 else T
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,11 +39,12 @@ class Static:
     shape: Body | Plane
     """A body, or a plane in the camera frame."""
     T_camera_body: Tensor | None = None
-    """(4, 4) pose of a body [m]; may require grad (a robot's links, say). None for a plane."""
+    """(4, 4) pose of a body [m]; may require grad (a robot's links, say); a ``Transform3d`` will do. None for a plane."""
     image: int = 0
     """Index of the image that it is in."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "T_camera_body", as_matrix(self.T_camera_body, single=True))
         if isinstance(self.shape, Plane):
             if self.T_camera_body is not None:
                 raise InvalidInputError("a static Plane is given in the camera frame and takes no T_camera_body")

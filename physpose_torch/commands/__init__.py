@@ -15,6 +15,7 @@ from physpose_torch.commands.eval import Eval
 from physpose_torch.commands.refine import Refine
 from physpose_torch.commands.report import Report
 from physpose_torch.commands.table import Table
+from physpose_torch.commands.view import View
 from physpose_torch.config import RefinerConfig
 from physpose_torch.errors import InvalidInputError
 
@@ -29,6 +30,7 @@ COMMANDS = {
     "ablate": Ablate,
     "table": Table,
     "decompose": Decompose,
+    "view": View,
 }
 PRESETS = {"default": RefinerConfig, "lm": RefinerConfig.lm, "paper": RefinerConfig.paper}
 
@@ -43,7 +45,7 @@ def parse(args: Sequence[str]) -> Any:
         options = {}
         if "preset" in command.__dataclass_fields__:
             own = config
-            if command is Refine and calibration is not None and args[0] == name:
+            if command in (Refine, View) and calibration is not None and args[0] == name:
                 own = config.calibrated(read_calibration(calibration))
             options["default"] = _with_defaults(command, preset=preset, config=own)
         choices.append(Annotated[command, tyro.conf.subcommand(name, **options)])

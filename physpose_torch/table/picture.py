@@ -4,7 +4,7 @@ Everything is computed from the camera model and `render_template`: no GL and no
 imported on use.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter
-from scipy.special import ndtri
 from torch import Tensor
 
 from physpose_torch import se3
@@ -21,11 +20,12 @@ from physpose_torch.geometry.body import Body, Plane
 from physpose_torch.table.grid import MARGIN, NEAR, Grid, grid_lines, plane_depth, table_grid
 from physpose_torch.table.template import Template, render_template
 from physpose_torch.table.view import SMALLEST, View, pixel_rays, project
+from physpose_torch.viz import ink
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-__all__ = ["table_picture"]
+__all__ = ["checked_size", "table_picture"]
 
 FINEST = (3.0, 8.0)
 """Where a cell is less high than this in the image [px], the lines are invisible; where it is more than that, clear."""
@@ -34,9 +34,8 @@ BRIGHT = 0.60
 TOUCHES = 0.006
 """A contact that lies deeper than this behind the surface seen there [m] is hidden."""
 
-_SUPER, _SHIFT = 4, 4  # samples per pixel and direction; fractional bits of their coordinates
 _STANDING, _OTHER, _CONTACT = "#12c4b4", "#ff8a1f", "#ffd83d"
-_LIGHT, _DARK, _INK, _PAPER, _FILL = "#ffffff", "#0b2545", "#33332f", "#f7f6f3", "#dddbd5"
+_LIGHT, _PAPER, _FILL = "#ffffff", "#f7f6f3", "#dddbd5"
 
 
 def table_picture(
@@ -79,7 +78,7 @@ def table_picture(
         InvalidInputError: shapes or lengths do not fit together, or poses are not rigid.
     """
     view = View(image, K, poses)
-    size = _checked_size(size, view)
+    size = checked_size(size, view)
     standing, contacts = _check(plane, bodies, view, standing, contacts)
     K, poses = view.K, view.measured
     if poses is None:
@@ -93,7 +92,7 @@ def table_picture(
     grid = table_grid(plane, torch.cat(surfaces) if surfaces else torch.zeros(0, 3, dtype=torch.float64), K, size)
 
     if view.image is None:
-        canvas = np.where((seen.owner >= 0).numpy()[..., None], _rgb(_FILL), _rgb(_PAPER))
+        canvas = np.where((seen.owner >= 0).numpy()[..., None], ink.rgb(_FILL), ink.rgb(_PAPER))
     else:
         canvas = view.image.numpy() / 255.0
     unit = max(min(size) / 480, 0.5)  # of line widths [px]
@@ -103,7 +102,7 @@ def table_picture(
     order = sorted(range(len(bodies)), key=lambda k: standing is not None and not bool(standing[k]))
     for k in order:  # those that do not stand come last, for theirs are the outlines to be noticed
         color = _STANDING if standing is None or bool(standing[k]) else _OTHER
-        canvas = _outline(canvas, (seen.owner == k).numpy(), color, unit)
+        canvas = ink.outline(canvas, (seen.owner == k).numpy(), color, unit)
     if grid is not None:
         canvas = _arrow(canvas, grid, K, shown, unit)
     canvas = _dots(canvas, contacts, K, seen, unit)
@@ -113,13 +112,18 @@ def table_picture(
     if standing is not None and drawn:
         colors = {True: (_STANDING, "on the table"), False: (_OTHER, "not on it")}
         legend += [colors[value] for value in (True, False) if any(bool(standing[k]) == value for k in drawn)]
-    picture = _compose(np.round(canvas * 255).astype(np.uint8), legend, title, caption, unit)
+    picture = ink.framed(np.round(canvas * 255).astype(np.uint8), legend, title, caption, unit)
     if path is not None:
         picture.save(path, optimize=True)
     return picture
 
 
-def _checked_size(size: tuple[int, int] | None, view: View) -> tuple[int, int]:
+def checked_size(size: tuple[int, int] | None, view: View) -> tuple[int, int]:
+    """Height and width of a picture [px]: the image's, or what was asked for where there is no image.
+
+    Raises:
+        InvalidInputError: it is not the image's size, or too small to show anything.
+    """
     if size is None:
         size = view.size
     elif view.image is not None and tuple(size) != view.size:
@@ -157,46 +161,6 @@ def _check(
     return standing, contacts
 
 
-def _rgb(color: str) -> np.ndarray:
-    return np.array([int(color[k : k + 2], 16) for k in (1, 3, 5)]) / 255
-
-
-def _mix(canvas: np.ndarray, color: str, alpha: np.ndarray) -> np.ndarray:
-    return canvas + alpha[..., None] * (_rgb(color) - canvas)
-
-
-def _ink(size: tuple[int, int], draw: Callable[[np.ndarray], object]) -> np.ndarray:
-    """What share (H, W) of every pixel is covered by what `draw` sets to 255 in an image of `_SUPER`² samples a pixel."""
-    fine = np.zeros((size[0] * _SUPER, size[1] * _SUPER), np.uint8)
-    draw(fine)
-    return cv2.resize(fine, (size[1], size[0]), interpolation=cv2.INTER_AREA) / 255.0
-
-
-def _fixed(pixels: Tensor) -> np.ndarray:
-    """Where pixels (..., 2) are in that image, as OpenCV wants it."""
-    return (((pixels + 0.5) * _SUPER - 0.5) * (1 << _SHIFT)).round().numpy().astype(np.int64)
-
-
-def _lines(size: tuple[int, int], ends: Tensor, width: float) -> np.ndarray:
-    """Cover (H, W) of lines between pixels (L, 2, 2)."""
-
-    def draw(fine: np.ndarray) -> None:
-        for a, b in _fixed(ends).tolist():
-            cv2.line(fine, a, b, 255, max(round(width * _SUPER), 1), cv2.LINE_8, _SHIFT)
-
-    return _ink(size, draw)
-
-
-def _discs(size: tuple[int, int], centres: Tensor, radius: float) -> np.ndarray:
-    """Cover (H, W) of discs around pixels (M, 2)."""
-
-    def draw(fine: np.ndarray) -> None:
-        for at in _fixed(centres).tolist():
-            cv2.circle(fine, at, round(radius * _SUPER * (1 << _SHIFT)), 255, -1, cv2.LINE_8, _SHIFT)
-
-    return _ink(size, draw)
-
-
 def _shown(grid: Grid, plane: Plane, K: Tensor, seen: Template) -> np.ndarray:
     """(H, W) from 1 at the objects to 0 where the grid ends, is too fine to be seen, or is behind an object."""
     depth = plane_depth(plane, K, tuple(seen.owner.shape))
@@ -219,25 +183,15 @@ def _lay_grid(canvas: np.ndarray, grid: Grid, K: Tensor, shown: np.ndarray, unit
     size = canvas.shape[:2]
     lines = grid_lines(grid, K, size)
     ends = project(K, lines.segments)
-    weak, strong = (_lines(size, ends[lines.strong == s], (1.0 + 0.5 * s) * unit) for s in (0, 1))
-    halo = _lines(size, ends[lines.strong], 3.5 * unit)
+    weak, strong = (ink.lines(size, ends[lines.strong == s], (1.0 + 0.5 * s) * unit) for s in (0, 1))
+    halo = ink.lines(size, ends[lines.strong], 3.5 * unit)
     grey, weight = canvas.mean(2), shown / max(shown.sum(), 1e-9)
     brightness = float((grey * weight).sum())
     contrast = float(((grey - brightness) ** 2 * weight).sum()) ** 0.5  # a chequered table has both dark and bright
-    line, other = (_DARK, _LIGHT) if brightness > BRIGHT else (_LIGHT, _DARK)
-    canvas = _mix(canvas, other, 0.08 * shown)
-    canvas = _mix(canvas, other, min(0.2 + contrast, 0.6) * halo * shown)
-    return _mix(canvas, line, np.maximum(0.5 * weak, 0.9 * strong) * shown)
-
-
-def _outline(canvas: np.ndarray, mask: np.ndarray, color: str, unit: float) -> np.ndarray:
-    """The border of a mask (H, W) as a line, half of it inside."""
-    mask = cv2.medianBlur(mask.astype(np.uint8), 3)  # scans have pinholes
-    sigma = max(unit, 1.0)
-    blurred = gaussian_filter(mask.astype(float), sigma, mode="nearest")
-    distance = sigma * np.abs(ndtri(blurred.clip(1e-9, 1 - 1e-9)))  # of a straight border, exactly [px]
-    canvas = _mix(canvas, _DARK, 0.35 * (0.5 + 1.5 * unit - distance).clip(0, 1))
-    return _mix(canvas, color, (0.5 + 0.8 * unit - distance).clip(0, 1))
+    line, other = (ink.DARK, _LIGHT) if brightness > BRIGHT else (_LIGHT, ink.DARK)
+    canvas = ink.mix(canvas, other, 0.08 * shown)
+    canvas = ink.mix(canvas, other, min(0.2 + contrast, 0.6) * halo * shown)
+    return ink.mix(canvas, line, np.maximum(0.5 * weak, 0.9 * strong) * shown)
 
 
 def _arrow(canvas: np.ndarray, grid: Grid, K: Tensor, shown: np.ndarray, unit: float) -> np.ndarray:
@@ -262,18 +216,18 @@ def _arrow(canvas: np.ndarray, grid: Grid, K: Tensor, shown: np.ndarray, unit: f
     along = tip - foot
     reach = float(along.norm())
     if reach < 4 * unit:  # seen from above: it comes towards the camera
-        canvas = _mix(canvas, _DARK, _discs(size, foot[None], 4.5 * unit))
-        return _mix(canvas, _LIGHT, _discs(size, foot[None], 3 * unit))
+        canvas = ink.mix(canvas, ink.DARK, ink.discs(size, foot[None], 4.5 * unit))
+        return ink.mix(canvas, _LIGHT, ink.discs(size, foot[None], 3 * unit))
     along = along / reach
     across = along.flip(0) * along.new_tensor([-1.0, 1.0])
     head = min(9 * unit, 0.6 * reach)
-    for color, grow in ((_DARK, 1.4 * unit), (_LIGHT, 0.0)):
+    for color, grow in ((ink.DARK, 1.4 * unit), (_LIGHT, 0.0)):
         back, side = tip - (head + grow) * along, (0.42 * head + 1.3 * grow) * across
-        corners = _fixed(torch.stack([tip + 1.8 * grow * along, back + side, back - side])).astype(np.int32)
+        corners = ink.fixed(torch.stack([tip + 1.8 * grow * along, back + side, back - side])).astype(np.int32)
         shaft = torch.stack([foot, tip - 0.8 * head * along])[None]
-        cover = _ink(size, lambda fine, c=corners: cv2.fillPoly(fine, [c], 255, cv2.LINE_8, _SHIFT))
-        cover = np.maximum(cover, _lines(size, shaft, 2.2 * unit + 2 * grow))
-        canvas = _mix(canvas, color, np.maximum(cover, _discs(size, foot[None], 2.6 * unit + grow)))
+        cover = ink.cover(size, lambda fine, c=corners: cv2.fillPoly(fine, [c], 255, cv2.LINE_8, ink.SHIFT))
+        cover = np.maximum(cover, ink.lines(size, shaft, 2.2 * unit + 2 * grow))
+        canvas = ink.mix(canvas, color, np.maximum(cover, ink.discs(size, foot[None], 2.6 * unit + grow)))
     return canvas
 
 
@@ -286,55 +240,8 @@ def _dots(canvas: np.ndarray, contacts: Tensor, K: Tensor, seen: Template, unit:
     contacts, pixels = contacts[inside], pixels[inside]
     column, row = pixels.round().long().unbind(1)
     hidden = (seen.owner[row, column] >= 0) & (seen.depth[row, column] < contacts[:, 2] - TOUCHES)
-    outer, ring, hole, core = (_discs(size, pixels[hidden], r * unit) for r in (4.0, 3.3, 2.0, 1.4))
-    canvas = _mix(canvas, _DARK, 0.45 * (outer - core))
-    canvas = _mix(canvas, _CONTACT, 0.7 * (ring - hole))
-    outer, inner = (_discs(size, pixels[~hidden], r * unit) for r in (4.0, 2.8))
-    return _mix(_mix(canvas, _DARK, outer), _CONTACT, inner)
-
-
-def _compose(
-    canvas: np.ndarray, legend: list[tuple[str | None, str]], title: str | None, caption: str | None, unit: float
-) -> "Image":
-    """The image (H, W, 3) uint8 with a legend, between a title and a caption."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-    from matplotlib.patches import Rectangle
-    from PIL import Image
-
-    height, width = canvas.shape[:2]
-    head, foot = (round(46 * unit) if title else 0), (round(44 * unit) if caption else 0)
-    total = head + height + foot
-    sheet = np.full((total, width, 3), 255, np.uint8)
-    sheet[head : head + height] = canvas
-    figure = Figure(figsize=(width / 100, total / 100), dpi=100, facecolor="white")
-    agg = FigureCanvasAgg(figure)
-    figure.figimage(sheet, 0, 0, origin="upper", zorder=-1)
-
-    def text(x: float, y: float, value: str, size: float, **style: object) -> float:
-        """Write, no wider than the picture; returns the width [px]."""
-        written = figure.text(x / width, 1 - y / total, value, size=size * unit, va="center", color=_INK, **style)
-        extent = written.get_window_extent(agg.get_renderer()).width
-        if extent > 0.96 * width:
-            written.set_size(size * unit * 0.96 * width / extent)
-        return extent
-
-    def box(x: float, y: float, w: float, h: float, **style: object) -> None:
-        corner = (x / width, 1 - (y + h) / total)
-        figure.add_artist(Rectangle(corner, w / width, h / total, transform=figure.transFigure, linewidth=0, **style))
-
-    if title:
-        text(width / 2, head / 2, title, 15, ha="center", weight="bold")
-    if caption:
-        text(width / 2, total - foot / 2, caption, 12.5, ha="center")
-    if legend:
-        margin, top, bottom = 8 * unit, head + height - 28 * unit, head + height - 8 * unit
-        x, middle = margin + 7 * unit, (top + bottom) / 2
-        for color, label in legend:
-            if color is not None:
-                box(x, middle - 1.5 * unit, 14 * unit, 3 * unit, facecolor=color, zorder=2)
-                x += 19 * unit
-            x += text(x, middle, label, 9, ha="left", zorder=3) + 12 * unit
-        box(margin, top, x - 5 * unit - margin, bottom - top, facecolor="white", alpha=0.8, zorder=1)
-    agg.draw()
-    return Image.fromarray(np.asarray(agg.buffer_rgba())[..., :3].copy())
+    outer, ring, hole, core = (ink.discs(size, pixels[hidden], r * unit) for r in (4.0, 3.3, 2.0, 1.4))
+    canvas = ink.mix(canvas, ink.DARK, 0.45 * (outer - core))
+    canvas = ink.mix(canvas, _CONTACT, 0.7 * (ring - hole))
+    outer, inner = (ink.discs(size, pixels[~hidden], r * unit) for r in (4.0, 2.8))
+    return ink.mix(ink.mix(canvas, ink.DARK, outer), _CONTACT, inner)

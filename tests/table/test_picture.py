@@ -13,6 +13,7 @@ from physpose_torch.table.grid import grid_lines, table_grid
 from physpose_torch.table.picture import table_picture
 from physpose_torch.table.template import eroded, grown, render_template
 from physpose_torch.table.view import pixel_rays, project
+from physpose_torch.viz import ink
 
 SIZE = (240, 320)
 K = torch.tensor([[300.0, 0, 160], [0, 300.0, 118], [0, 0, 1]], dtype=torch.float64)
@@ -218,7 +219,7 @@ def test_outlines_tell_what_stands_on_the_table(scene):
 def test_an_outline_is_as_wide_as_asked_for_and_nowhere_else(unit):
     mask = np.zeros((160, 200), bool)
     mask[:, 100:] = True
-    row = picture._outline(np.full((160, 200, 3), 0.2), mask, "#ffffff", unit)[80, :, 0]
+    row = ink.outline(np.full((160, 200, 3), 0.2), mask, "#ffffff", unit)[80, :, 0]
     alpha = (row - 0.2) / 0.8
     assert (alpha > 0.5).sum() == pytest.approx(1.6 * unit, abs=1)
     assert (alpha[: int(97 - 2 * unit)] == 0).all()

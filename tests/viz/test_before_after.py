@@ -11,10 +11,10 @@ import torch
 import trimesh
 from PIL import Image
 
-from physpose_torch import viz
 from physpose_torch.errors import InvalidInputError
 from physpose_torch.household import household_meshes, household_scene, perturb_like_estimator
-from physpose_torch.viz import before_after_picture
+from physpose_torch.viz import before_after, before_after_picture
+from physpose_torch.viz.scene import corner_normals
 
 K = torch.tensor([[600.0, 0, 319.5], [0, 600.0, 239.5], [0, 0, 1]], dtype=torch.float64)
 CAMERA = {"K": K, "height": 480, "width": 640}
@@ -60,7 +60,7 @@ def one_thread():
 
 @pytest.fixture
 def small(monkeypatch):
-    monkeypatch.setattr(viz, "_COLUMN", 140)
+    monkeypatch.setattr(before_after, "_COLUMN", 140)
 
 
 def test_household_picture_is_complete_fast_and_small(tmp_path):
@@ -152,15 +152,15 @@ def test_bad_input_is_named():
 
 
 def test_corner_normals_keep_creases_and_smooth_the_rest():
-    np.testing.assert_allclose(viz._corner_normals(BOX), np.repeat(BOX.face_normals[:, None], 3, 1), atol=1e-12)
+    np.testing.assert_allclose(corner_normals(BOX), np.repeat(BOX.face_normals[:, None], 3, 1), atol=1e-12)
     ball = trimesh.creation.icosphere(subdivisions=3)
-    np.testing.assert_allclose(viz._corner_normals(ball), ball.vertices[ball.faces], atol=0.02)
+    np.testing.assert_allclose(corner_normals(ball), ball.vertices[ball.faces], atol=0.02)
 
 
 def test_import_is_light_and_pyplot_stays_out():
     code = (
         "import sys, torch, trimesh\n"
-        "from physpose_torch import viz\n"
+        "from physpose_torch.viz import before_after as viz\n"
         "assert 'matplotlib' not in sys.modules\n"
         "viz._COLUMN = 60\n"
         "T = torch.eye(4)[None].clone(); T[:, 2, 3] = 0.5\n"
@@ -170,3 +170,29 @@ def test_import_is_light_and_pyplot_stays_out():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.usefixtures("small")
+def test_uncertainty_is_drawn_in_the_column_it_belongs_to_and_is_longest_along_the_ray():
+    def unsure(picture):
+        r, g, b = np.asarray(picture).astype(int).transpose(2, 0, 1)
+        return (b > 1.25 * r) & (r > 1.15 * g)
+
+    poses = torch.stack([box_on_table()])
+    ray = torch.nn.functional.normalize(poses[0, :3, 3], dim=0)
+    C = torch.eye(6, dtype=torch.float64)[None] * 0.002**2
+    C[0, :3, :3] += (0.02**2 - 0.002**2) * torch.outer(ray, ray)
+    options = dict(plane=PLANE, colors=GREY[:1], **CAMERA)
+    bare = np.asarray(before_after_picture([BOX], poses, poses, **options))
+    drawn = np.asarray(before_after_picture([BOX], poses, poses, covariance_after=C, **options))
+    middle = bare.shape[1] // 2
+    assert not unsure(bare).any()
+    assert unsure(drawn)[:, middle:].sum() > 20
+    legend = unsure(drawn)[:, :middle].sum()
+    assert legend <= 121 + 20  # the square of the legend and nothing else
+    both = np.asarray(before_after_picture([BOX], poses, poses, covariance_before=C, covariance_after=C, **options))
+    assert unsure(both)[:, :middle].sum() > legend + 20
+    # through the camera one looks along the ellipsoid, from the side it rises towards the camera
+    y, _ = np.nonzero(unsure(drawn)[:, middle:])
+    camera, beside = np.split(np.sort(y), [(np.diff(np.sort(y))).argmax() + 1])
+    assert np.ptp(beside) > 2 * np.ptp(camera)
