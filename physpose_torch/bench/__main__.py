@@ -16,6 +16,7 @@ from typing import Annotated, Any, Union
 import torch
 import tyro
 
+from physpose_torch.bench.grasp import GraspOptions, run_grasps
 from physpose_torch.bench.growth import GrowthCase, bench_growth, growth_table, sweep
 from physpose_torch.bench.images import load_images
 from physpose_torch.bench.loops import installed_loops
@@ -26,6 +27,7 @@ from physpose_torch.bench.part_pairs import make_part_pairs
 from physpose_torch.bench.plot import plot_costs
 from physpose_torch.bench.scenes import bench_scenes, make_config, scenes_table
 from physpose_torch.bench.tables import TableOptions, run_tables
+from physpose_torch.bench.training import TrainingOptions, run_training
 from physpose_torch.distance.autograd import backends
 from physpose_torch.errors import InvalidInputError, PhysPoseError
 
@@ -154,6 +156,26 @@ class Table(TableOptions, _Bench):
 
 
 @dataclass(frozen=True)
+class Grasp(GraspOptions, _Bench):
+    """The paper's grasping test by geometry: how often a gripper sent to estimated and to refined poses gets hold."""
+
+    def run(self, results: dict[str, Any], device: torch.device) -> None:
+        if self.plot is not None:
+            raise InvalidInputError("--plot: grasp measures no cost against size; use --json")
+        run_grasps(results, self, self.seed)
+
+
+@dataclass(frozen=True)
+class Training(TrainingOptions, _Bench):
+    """A pose network trained with and without the physics term, over several seeds from --seed on: physics and pose errors."""
+
+    def run(self, results: dict[str, Any], device: torch.device) -> None:
+        if self.plot is not None or self.data is not None or self.backend or device.type != "cpu":
+            raise InvalidInputError("training: runs on generated scenes on the CPU; no --plot, --data, --backend, --device")
+        run_training(results, self, self.seed)
+
+
+@dataclass(frozen=True)
 class All(_Bench):
     """Pairs, scenes and growth with modest sizes: what runs without a subcommand."""
 
@@ -169,7 +191,15 @@ class All(_Bench):
         Growth(**common).run(results, device)
 
 
-COMMANDS = {"all": All, "pairs": Pairs, "scenes": Scenes, "growth": Growth, "table": Table}
+COMMANDS = {
+    "all": All,
+    "pairs": Pairs,
+    "scenes": Scenes,
+    "growth": Growth,
+    "table": Table,
+    "grasp": Grasp,
+    "training": Training,
+}
 
 
 def run_pairs(results, device, count, data, seed, names) -> None:

@@ -61,8 +61,9 @@ class View(ImageOptions):
     """Port to serve at; the next free one, if it is taken."""
 
     def __call__(self) -> int:
-        from physpose_torch.viz.viewer import PoseViewer, serve
+        from physpose_torch.viz.viewer import PoseViewer, load_viser, serve
 
+        load_viser()  # before minutes of work
         if not 0 <= self.port < 65536:
             raise InvalidInputError(f"--port {self.port}: expected 0 to 65535")
         config = replace(self.config, keep_trajectory=True)

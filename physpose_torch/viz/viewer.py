@@ -12,7 +12,7 @@ from physpose_torch.viz.viewed import ViewedImage
 if TYPE_CHECKING:
     import viser
 
-__all__ = ["PoseViewer", "serve"]
+__all__ = ["PoseViewer", "load_viser", "serve"]
 
 
 class PoseViewer:
@@ -55,7 +55,7 @@ class PoseViewer:
         self._closed = threading.Event()
         self._player: threading.Thread | None = None
         self._changing = False
-        self.server = _viser().ViserServer(host=host, port=port, label="physpose", verbose=False)
+        self.server = load_viser().ViserServer(host=host, port=port, label="physpose", verbose=False)
         try:
             self._build_controls()
             self.show_image(0)
@@ -214,7 +214,12 @@ def serve(viewer: PoseViewer) -> None:
         viewer.close()
 
 
-def _viser() -> "viser":
+def load_viser() -> "viser":
+    """The package.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
     try:
         import viser
     except ImportError as error:

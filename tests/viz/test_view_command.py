@@ -143,3 +143,10 @@ def test_it_serves_until_ctrl_c_and_then_ends_well(dataset):
         process.kill()
     assert process.returncode == 0, error
     assert "Traceback" not in error
+
+
+def test_without_viser_nothing_is_begun(dataset, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    monkeypatch.setattr("physpose_torch.demo.run_demo", lambda **options: pytest.fail("work has begun"))
+    assert main(["view", "--demo"]) == 2
+    assert 'pip install "physpose-torch[viz]"' in capsys.readouterr().err
