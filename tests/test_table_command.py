@@ -178,6 +178,9 @@ def test_intrinsics_of_another_size_are_refused(files, tmp_path, capsys):
         ({"48": {"1": 5}}, "expected"),
         ({"48": {"1": {"second": "2"}}}, "second is '2'"),
         ({"48": {"1": {"files": ["../secret.png"]}}}, "leaves the folder"),
+        ({"48": {"1": {"gravity": [0, 0, 0]}}}, "image 1: gravity"),
+        ({"48": {"1": {"gravity": "down"}}}, "image 1: gravity"),
+        ({"48": {"1": {"gravity": [0, 1, float("nan")]}}}, "image 1: gravity|NaN"),
         ({"x": {}}, "ids as keys"),
     ],
 )
@@ -241,6 +244,21 @@ def test_an_image_whose_table_is_not_found_keeps_its_poses(files, dataset, tmp_p
     assert code == 1
     assert "gravity" in caplog.text
     assert out.read_text() == alone.read_text()
+
+
+def test_gravity_tells_the_table_under_a_single_object(files, dataset, tmp_path):
+    """Which of the box's sides is down, that is."""
+    alone, pairs = tmp_path / "one.csv", tmp_path / "pairs.json"
+    rows = (dataset / "estimates.csv").read_text().splitlines()
+    box = 1 + files.pair.names.index("box")
+    alone.write_text("\n".join([rows[0], *(r for r in rows[1:] if r.split(",")[:3] == ["1", "0", str(box)])]) + "\n")
+    pairs.write_text(json.dumps({"1": {"0": {"gravity": (-9.81 * files.pair.normal).tolist()}}}))
+    code = main(
+        ["refine", str(alone), "--dataset", str(dataset), "--models", str(files.hulls), "--out", str(tmp_path / "out.csv"),
+         "--table", "support", "--pairs", str(pairs), "--quiet"]
+    )  # fmt: skip
+    assert code == 0
+    assert (tmp_path / "out.csv").read_text() != alone.read_text()
 
 
 def test_pairs_without_table_are_refused(files, dataset, tmp_path, capsys):

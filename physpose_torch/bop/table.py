@@ -46,6 +46,8 @@ class Pair(NamedTuple):
     """Image id of the partner; its estimates are used, too. None: there is none."""
     files: tuple[Path | None, Path | None]
     """Image files; None: the dataset's."""
+    gravity: Tensor | None = None
+    """(3,) unit vector pointing down in the image's camera, by an IMU or a robot; None: not known."""
 
 
 def read_scene(path: str | Path) -> TableScene:
@@ -149,10 +151,11 @@ def write_table(path: str | Path, estimate: TableEstimate) -> None:
 
 
 def read_pairs(path: str | Path) -> dict[tuple[int, int], Pair]:
-    """Read which image goes with which: ``{scene: {image: {"second": image | null, "files": [first, second] | null}}}``.
+    """Read which image goes with which: ``{scene: {image: {"second": image, "files": [first, second], "gravity": [3]}}}``.
 
-    ``second`` is the id of the partner in the same scene; ``files`` are image files relative to the JSON's folder, which they
-    may not leave, and are only needed where the dataset has no images.
+    All are optional. ``second`` is the id of the partner in the same scene; ``files`` are image files relative to the JSON's
+    folder, which they may not leave, and are only needed where the dataset has no images; ``gravity`` points down in the
+    camera frame of the (first) image, of any length.
 
     Raises:
         DataError: the file is missing or broken, or an entry is not of this form.
@@ -176,8 +179,19 @@ def read_pairs(path: str | Path) -> dict[tuple[int, int], Pair]:
                 if not file.is_relative_to(path.parent.resolve()):
                     raise DataError(f"{where}: {name!r} leaves the folder {path.parent}; put the image next to the JSON file")
                 inside.append(file)
-            pairs[scene, image] = Pair(second, (*inside, None, None)[:2])
+            pairs[scene, image] = Pair(second, (*inside, None, None)[:2], _direction(entry.get("gravity"), where))
     return pairs
+
+
+def _direction(value: Any, where: str) -> Tensor | None:
+    if value is None:
+        return None
+    numbers = isinstance(value, list) and len(value) == 3 and all(type(x) in (int, float) for x in value)
+    gravity = torch.tensor(value if numbers else [0.0] * 3, dtype=torch.float64)
+    length = torch.linalg.vector_norm(gravity)
+    if not 0 < float(length) < math.inf:
+        raise DataError(f"{where}: gravity is {value!r}, expected three numbers that point down in the camera frame")
+    return gravity / length
 
 
 class TablesOnTheWay:
@@ -217,7 +231,7 @@ class TablesOnTheWay:
         if pair.second is not None:
             other = self._partner(scene_id, pair.second, obj_ids)
             views.append(self._view(scene_id, pair.second, pair.files[1], other))
-        estimate = self.estimator(views, bodies)
+        estimate = self.estimator(views, bodies, gravity=pair.gravity)
         return estimate.plane, estimate.warnings
 
     def _best(self, same: Sequence[int], rows: np.ndarray) -> list[int]:

@@ -50,8 +50,8 @@ class ImageOptions:
     """Estimate the table plane of images that PLANES has none for: from the objects' poses and, with auto and joint, from the
     dataset's images or those that PAIRS names."""
     pairs: Path | None = None
-    """Second images for --table: {scene: {image: {"second": image, "files": [first, second]}}}, files only where the dataset
-    has no images."""
+    """Second images and gravity for --table: {scene: {image: {"second": image, "files": [first, second], "gravity": [3]}}}, all
+    optional: files only where the dataset has no images, gravity pointing down in the image's camera."""
     plane_sigma_mm: float = 2.0
     """Standard deviation of the height of planes whose entry states none; contacts are as soft. 0: they are exact. Scans,
     true poses and tables agree to a few mm, not better."""
