@@ -270,7 +270,8 @@ class TableConfig:
     """Standard deviation of the depth factor that all estimates share; only images can tell it."""
     sigma_scale: float = 0.015
     """Standard deviation of the scale of everything that images tell: focal lengths and models are known no better. It is only
-    added to what the result is said to be worth. On the two real YCB-V frames images and ground truth differ by 1 to 3 %."""
+    added to what the result is said to be worth against the world. On the two real YCB-V frames images and ground truth
+    differ by 1 to 3 %."""
     sigma_surface: float = 0.0007
     """Standard deviation of real surfaces from the meshes [m]."""
     sigma_contact: float = 0.001

@@ -148,7 +148,7 @@ def measure(
         "seconds": time.perf_counter() - start,
         "angle_deg": angle,
         "offset_mm": offset,
-        "mahalanobis_squared": float(off @ torch.linalg.pinv(found.covariance, hermitian=True) @ off),
+        "mahalanobis_squared": float(off @ torch.linalg.pinv(estimate.covariance, hermitian=True) @ off),
         "sigma_tilt_deg": math.degrees(estimate.sigma_tilt),
         "sigma_offset_mm": 1e3 * estimate.sigma_offset,
         "depth_factor": estimate.depth_factor,

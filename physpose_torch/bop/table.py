@@ -134,8 +134,11 @@ def table_entry(estimate: TableEstimate) -> dict[str, Any]:
     return {
         "normal": estimate.plane.normal.tolist(),
         "offset_mm": float(estimate.plane.offset) / MM,
-        "sigma_deg": math.degrees(estimate.sigma_tilt),
-        "sigma_mm": estimate.sigma_offset / MM,
+        # against poses estimated in the same images, for contacts; and against the world
+        "sigma_deg": math.degrees(float(torch.linalg.eigvalsh(estimate.plane.covariance[:2, :2].double()).amax().sqrt())),
+        "sigma_mm": float(estimate.plane.covariance[2, 2].double().sqrt()) / MM,
+        "sigma_world_deg": math.degrees(estimate.sigma_tilt),
+        "sigma_world_mm": estimate.sigma_offset / MM,
         "scale": estimate.scale,
         "method": estimate.method,
         "inliers": estimate.inliers,

@@ -21,10 +21,6 @@ __all__ = ["ImageOptions", "Images", "in_batches", "together"]
 
 
 T = TypeVar("T")
-SHARED_SCALE = 0.002
-"""Relative standard deviation of a table's scale against poses that were estimated in the same image."""
-
-
 class Images(NamedTuple):
     """An opened result file."""
 
@@ -128,9 +124,7 @@ class ImageOptions:
                 raise InvalidInputError(f"--pairs {self.pairs} says where second images are; add --table auto to use them")
             return None
         pairs = read_pairs(self.pairs) if self.pairs is not None else {}
-        # the poses that meet the plane are of the same images: what scales both alike is no reason to trust it less
-        config = TableConfig(method=self.table, sigma_scale=SHARED_SCALE)
-        return TablesOnTheWay(estimates, dataset, pairs, TableEstimator(config))
+        return TablesOnTheWay(estimates, dataset, pairs, TableEstimator(TableConfig(method=self.table)))
 
 
 def in_batches(images: Iterable[ImageScene], size: int) -> Iterator[list[ImageScene]]:

@@ -23,6 +23,8 @@ FINE = (3.0, 2.0, 1.5, 1.0, 1.0, 1.0)
 """The same from a good one."""
 SHARED = 10
 """Unknowns that all rows may see: second camera (6), plane (3), depth factor (1); then six of the row's own object."""
+FACTOR = 9
+"""Place of the depth factor among them."""
 RIDGE = (1.0, 1e-4, 1.0)
 """Weight that keeps the second camera, objects and plane from running where nothing holds them, in units of 1 m and 1 rad."""
 DIFFERENCE = 1e-6
@@ -89,6 +91,8 @@ class Fit(NamedTuple):
     state: State
     covariance: Tensor
     """(3, 3) of the plane: two tilts along ``tangent_basis(normal)`` [rad] and its height at the middle [m]."""
+    relative: Tensor
+    """(3, 3) the same for a given depth factor: how well the plane is known against poses that share its error."""
     cost: float
     """Negative log-likelihood up to a constant."""
     surprise: tuple[Tensor, ...]
@@ -101,7 +105,9 @@ def adjust(state: State, terms: Sequence[Term], schedule: Sequence[float]) -> Fi
         matrix, gradient, _, _ = _normal_equations(state, terms, scale)
         state = _moved(state, -torch.linalg.solve(matrix, gradient).clamp(-LARGEST_STEP, LARGEST_STEP))
     matrix, _, cost, surprise = _normal_equations(state, terms, 1.0)
-    return Fit(state, torch.linalg.inv(matrix)[6:9, 6:9], cost, surprise)
+    given = [i for i in range(len(matrix)) if i != FACTOR]
+    relative = torch.linalg.inv(matrix[given][:, given])
+    return Fit(state, torch.linalg.inv(matrix)[6:9, 6:9], relative[6:9, 6:9], cost, surprise)
 
 
 def unknowns_at(state: State) -> Unknowns:

@@ -41,7 +41,10 @@ class TableEstimate:
     """A table plane, and what it is worth."""
 
     plane: Plane
-    """In the camera of view 0, with its covariance."""
+    """In the camera of view 0. Its covariance is that against poses estimated in the same images, which share the error of its
+    scale: what contacts with it need."""
+    covariance: Tensor
+    """(3, 3) the same against the world: that error included."""
     method: str
     """What it was found by."""
     scale: float | None
@@ -64,13 +67,13 @@ class TableEstimate:
 
     @property
     def sigma_tilt(self) -> float:
-        """Standard deviation of the normal, the worse of two axes [rad]."""
-        return float(torch.linalg.eigvalsh(self.plane.covariance[:2, :2].double()).amax().sqrt())
+        """Standard deviation of the normal against the world, the worse of two axes [rad]."""
+        return float(torch.linalg.eigvalsh(self.covariance[:2, :2].double()).amax().sqrt())
 
     @property
     def sigma_offset(self) -> float:
-        """Standard deviation of the height under the objects [m]."""
-        return float(self.plane.covariance[2, 2].double().sqrt())
+        """Standard deviation of the height under the objects against the world [m]."""
+        return float(self.covariance[2, 2].double().sqrt())
 
     def __repr__(self) -> str:
         normal = ", ".join(f"{x:.4f}" for x in self.plane.normal.tolist())
@@ -126,8 +129,8 @@ class TableEstimator:
         like = next(v.poses for v in problem.views if v.poses is not None)
         plane = estimate.plane
         plane = Plane(*(x.to(like) for x in (plane.normal, plane.offset, plane.covariance)))
-        moved = {"plane": plane, "poses": estimate.poses.to(like), "contacts": estimate.contacts.to(like)}
-        return TableEstimate(**{**estimate.__dict__, **moved})
+        moved = {name: getattr(estimate, name).to(like) for name in ("covariance", "poses", "contacts")}
+        return TableEstimate(**{**estimate.__dict__, **moved, "plane": plane})
 
     def _problem(self, views: View | Sequence[View], bodies: Sequence[Body], gravity: Tensor | None) -> "Problem":
         from physpose_torch.table.found import Problem
@@ -201,7 +204,8 @@ class TableEstimator:
             if not fits:
                 raise TableNotFoundError("images and estimated poses contradict each other; check the intrinsics")
             rival = rival_cost(fits)
-            fit = fits[0]._replace(covariance=fits[0].covariance * solution.disagreement / 2.0)
+            worse = solution.disagreement / 2.0
+            fit = fits[0]._replace(covariance=fits[0].covariance * worse, relative=fits[0].relative * worse)
             return self._of_fit(problem, fit, "support", rival, None, warnings, two=False)
         two = solution.two
         return self._of_fit(problem, solution.fit, "joint", solution.rival, solution.table, warnings, two=two)
@@ -287,6 +291,7 @@ class TableEstimator:
             poses=state.poses,
             standing=standing,
             depth_factor=float(state.depth_factor),
+            relative=fit.relative,
             warnings=warnings,
         )
 
@@ -304,12 +309,14 @@ class TableEstimator:
         poses: Tensor | None = None,
         standing: Tensor | None = None,
         depth_factor: float = 1.0,
+        relative: Tensor | None = None,
         warnings: Sequence[str] = (),
     ) -> TableEstimate:
         """The estimate, if it is worth one."""
         from physpose_torch.table.standing import standing_on
 
         covariance = 0.5 * (covariance + covariance.mT)
+        relative = covariance.clone() if relative is None else 0.5 * (relative + relative.mT)
         if method != "support":
             covariance[2, 2] += (self.config.sigma_scale * offset) ** 2
         tilt = float(torch.linalg.eigvalsh(covariance[:2, :2]).amax().clamp_min(0).sqrt())
@@ -335,7 +342,7 @@ class TableEstimator:
             slack = self.config.sigma_ray_fraction * torch.linalg.vector_norm(poses[:, :3, 3], dim=1)
             standing = here & (height_of.abs() < 3 * slack)
         contacts = se3.apply(poses[standing], feet.points[standing]).reshape(-1, 3)
-        plane = Plane(normal, offset, covariance)
+        plane = Plane(normal, offset, relative)
         return TableEstimate(
-            plane, method, scale, inliers, tuple(warnings), depth_factor, motion, poses, standing, contacts
+            plane, covariance, method, scale, inliers, tuple(warnings), depth_factor, motion, poses, standing, contacts
         )

@@ -70,6 +70,8 @@ class Supported(NamedTuple):
     state: State
     covariance: Tensor
     """(3, 3) see :class:`~physpose_torch.table.adjustment.Fit`."""
+    relative: Tensor
+    """(3, 3) likewise."""
     cost: float
     standing: Tensor
     """(N,) bool."""
@@ -304,7 +306,7 @@ def _supported(problem: Problem, fit: Fit, terms: Sequence[Term]) -> Supported:
     for term, squared in zip(terms, fit.surprise, strict=True):
         if isinstance(term, Contact):
             standing[term.owner] = squared < STANDS
-    return Supported(fit.state, fit.covariance, fit.cost, standing)
+    return Supported(fit.state, fit.covariance, fit.relative, fit.cost, standing)
 
 
 def _solution(problem: Problem, fit: Fit, terms: Sequence[Term], rival: float, two: bool) -> Solution:

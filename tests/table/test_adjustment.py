@@ -401,7 +401,11 @@ def test_cost_and_covariance_are_at_scale_one_whatever_the_schedule_was(table):
     assert_states_agree(still.state, start, 0.0)
     matrix, _, cost, _ = _normal_equations(start, terms, 1.0)
     assert still.cost == pytest.approx(cost)
-    torch.testing.assert_close(still.covariance, torch.linalg.inv(matrix)[6:9, 6:9])
+    everything = torch.linalg.inv(matrix)
+    torch.testing.assert_close(still.covariance, everything[6:9, 6:9])
+    # for a given depth factor: what is left of it by the rule for conditional normal distributions
+    cross = everything[6:9, 9]
+    torch.testing.assert_close(still.relative, everything[6:9, 6:9] - cross[:, None] * cross / everything[9, 9])
     a, b = (adjust(start, terms, s + (1.0,) * 12) for s in (ROUGH, FINE))
     assert a.cost == pytest.approx(b.cost, rel=1e-6)
     torch.testing.assert_close(a.covariance, b.covariance, rtol=1e-3, atol=0)
