@@ -26,7 +26,9 @@ __all__ = [
     "list_variants",
     "scale_depth",
     "slide_onto_planes",
+    "tilted",
     "with_exact_planes",
+    "with_planes",
     "without_planes",
 ]
 
@@ -119,7 +121,7 @@ def without_planes(scene: Scene) -> Scene:
 
 def with_exact_planes(scene: Scene) -> Scene:
     """The scene of one image, its planes taken as exact."""
-    return _with_planes(scene, [Plane(p.shape.normal, p.shape.offset) for p in scene.planes])
+    return with_planes(scene, [Plane(p.shape.normal, p.shape.offset) for p in scene.planes])
 
 
 def disturb(
@@ -151,17 +153,31 @@ def disturb(
     for static in scene.planes:
         plane = static.shape
         draw = torch.randn(3, generator=generator, dtype=torch.float64)
-        point = middle - (plane.normal @ middle - plane.offset) * plane.normal
-        # rising along a tangent by the angle turns the normal back by it
-        slope = torch.tan(tilt * draw[:2]) @ tangent_basis(plane.normal[None])[0]
-        normal = torch.nn.functional.normalize(plane.normal - slope, dim=0)
         covariance = added if plane.covariance is None else added + plane.covariance
         exact = tilt == 0 and offset == 0 and plane.covariance is None
-        planes.append(Plane(normal, normal @ point + offset * draw[2], None if exact else covariance))
-    return _with_planes(scene, planes)
+        wrong = tilted(plane, middle, tilt * draw[:2], offset * draw[2])
+        planes.append(Plane(wrong.normal, wrong.offset, None if exact else covariance))
+    return with_planes(scene, planes)
 
 
-def _with_planes(scene: Scene, planes: list[Plane]) -> Scene:
+def tilted(plane: Plane, middle: Tensor, tilt: Tensor, offset: Tensor | float) -> Plane:
+    """A plane turned about its point that is nearest to another point, and moved; its covariance stays as it is.
+
+    Args:
+        plane: in the camera frame.
+        middle: (3,) that point [m].
+        tilt: (2,) by how much it rises along two tangents [rad].
+        offset: how far it moves along its new normal [m].
+    """
+    point = middle - (plane.normal @ middle - plane.offset) * plane.normal
+    # rising along a tangent by the angle turns the normal back by it
+    slope = torch.tan(tilt) @ tangent_basis(plane.normal[None])[0]
+    normal = torch.nn.functional.normalize(plane.normal - slope, dim=0)
+    return Plane(normal, normal @ point + offset, plane.covariance)
+
+
+def with_planes(scene: Scene, planes: list[Plane]) -> Scene:
+    """The scene of one image with other planes; gravity goes along where it is that of a single plane."""
     gravity = scene.gravity
     if len(planes) == 1 and bool((gravity != 0).any()):
         gravity = -planes[0].normal[None]
@@ -199,7 +215,7 @@ def list_variants(
             "one depth factor",
             BASELINES,
             baseline=partial(scale_depth, factor=factor),
-            label=f"one depth factor {factor:.3f} ({source})",
+            label=f"depth × {factor:.3f} ({source})",
             always=True,
         ),
         Variant("slide onto the plane", BASELINES, baseline=slide_onto_planes, always=True),

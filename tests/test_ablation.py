@@ -16,6 +16,7 @@ from physpose_torch.ablation import (
     list_variants,
     scale_depth,
     slide_onto_planes,
+    tilted,
     with_exact_planes,
     with_solver,
     without_planes,
@@ -75,7 +76,7 @@ def test_every_refined_row_but_the_reference_changes_something_and_names_are_uni
     same = {row.name for row in rows if row.config == config and row.knowledge == "known"}
     assert same == {"P + C + G", "known scene"}
     assert {row.name for row in rows if row.always} == ALWAYS
-    assert all(len(row.shown) <= 33 for row in rows)
+    assert all(len(row.shown) <= 27 for row in rows)
 
 
 def test_each_row_changes_what_its_name_says_and_nothing_else():
@@ -110,7 +111,7 @@ def test_rows_about_planes_and_calibration_are_there_only_with_them():
     assert not names & {"slide onto the plane", "no plane", "plane disturbed", "plane exact", "calibrated"}
     assert {"input", "P + C + G", "without C", "initial", "known scene"} <= names
     with_both = {row.name: row for row in list_variants(RefinerConfig(), calibration=CALIBRATION)}
-    assert with_both["one depth factor"].shown == "one depth factor 0.980 (C.json)"
+    assert with_both["one depth factor"].shown == "depth × 0.980 (C.json)"
     assert with_both["calibrated, plane disturbed"].knowledge == "disturbed"
 
 
@@ -203,6 +204,15 @@ def test_disturbing_by_nothing_changes_nothing_and_known_variances_are_added(tab
         assert (same.covariance is None) == (plane.covariance is None)
     more = disturb(Scene.tabletop([box], known), poses, tilt=0, offset=0.002, generator=generator).planes[0].shape
     assert float(more.covariance[2, 2]) == pytest.approx(5e-6)
+
+
+def test_a_tilted_plane_turns_about_the_point_below_and_rises_along_its_new_normal(table):
+    middle = table.at(0.2, 0.1, 0.3)[:3, 3]
+    known = Plane(table.plane.normal, table.plane.offset, 1e-6 * torch.eye(3, dtype=torch.float64))
+    plane = tilted(known, middle, torch.tensor([0.1, 0.0], dtype=torch.float64), 0.01)
+    assert float(torch.arccos(plane.normal @ known.normal)) == pytest.approx(0.1)
+    assert float(plane.offset - plane.normal @ table.at(0.2, 0.1)[:3, 3]) == pytest.approx(0.01)
+    assert torch.equal(plane.covariance, known.covariance)
 
 
 def test_exact_and_absent_planes_leave_all_else_as_it_is(table, box, can):
@@ -316,7 +326,7 @@ def test_a_calibration_adds_rows_and_brings_its_own_depth_factor(dataset):
     assert code == 0
     rows = {row["name"]: row for row in content["rows"]}
     assert rows["calibrated"]["config"]["physics"]["depth_factor"] == pytest.approx(1 / 1.02)
-    assert rows["one depth factor"]["label"] == "one depth factor 0.980 (C.json)"
+    assert rows["one depth factor"]["label"] == "depth × 0.980 (C.json)"
     assert rows["one depth factor"]["ar_mssd"] == 1  # that is all that is wrong with these estimates
 
 
@@ -366,3 +376,98 @@ def test_baselines_of_a_file_are_exact(dataset):
     truth = metres(np.stack([standing(-80, 0, 50), standing(60, 30, 15), standing(-50, 0, 15), standing(0, 0, 35)]))
     torch.testing.assert_close(scale_depth(batch.measured, batch.scene(), factor=1 / 1.02), truth)
     torch.testing.assert_close(slide_onto_planes(batch.measured, batch.scene()), truth, atol=2e-5, rtol=0)
+
+
+# ---- what is made worse
+
+
+def test_rows_tell_whom_they_made_worse_than_the_input_and_by_how_much_recall_changed(dataset):
+    """All estimates are 2 % too far away, by at least 10 mm: the right factor makes all better, the wrong one all worse."""
+    numbers = {"depth_factor": 1 / 1.02, "sigma_ray_fraction": 0.005, "sigma_lateral_mm": 2, "sigma_rotation_deg": 1}
+    for factor, worse in ((1 / 1.02, 0), (1.02, 1)):
+        (dataset / "c.json").write_text(json.dumps(numbers | {"depth_factor": factor}))
+        more = ("--preset", "lm", "--rows", "without C", "--calibration", dataset / "c.json", "--quiet")
+        rows = {row["name"]: row for row in ablate(dataset, *more)[1]["rows"]}
+        made = [rows["one depth factor"][key] for key in ("made_worse", "made_better")]
+        assert [m["value"] for m in made] == [worse, 1 - worse]
+        assert [(m["low"], m["high"]) for m in made] == [(worse, worse), (1 - worse, 1 - worse)]
+        assert rows["one depth factor"]["objects"] == 4
+    assert rows["input"]["made_worse"] == rows["input"]["made_better"] == {"value": 0, "low": 0, "high": 0}
+    assert rows["input"]["change_mssd"] == {"value": 0, "low": 0, "high": 0}
+    gain = rows["P + C + G"]["ar_mssd"] - rows["input"]["ar_mssd"]
+    assert rows["P + C + G"]["change_mssd"]["value"] == pytest.approx(gain)
+    assert rows["P + C + G"]["change_mssd"]["value"] == pytest.approx(-rows["input"]["difference_mssd"]["value"])
+
+
+def test_an_image_that_is_not_refined_does_not_count_as_unharmed(dataset):
+    planes = json.loads((dataset / "planes.json").read_text())
+    del planes["2"]["3"]  # that of two objects
+    (dataset / "planes.json").write_text(json.dumps(planes))
+    _, content = ablate(dataset, "--preset", "lm", "--rows", "without C", "--quiet")
+    assert {row["objects"] for row in content["rows"]} == {2}
+
+
+# ---- planted failures
+
+
+def test_each_planted_failure_is_a_block_of_rows_compared_with_its_own_input(dataset, capsys):
+    code, content = ablate(dataset, "--preset", "lm", "--plant", "wrong-plane", "outliers", "accurate")
+    assert code == 0
+    assert "rows" not in content
+    blocks = {block["label"]: block for block in content["planted"]}
+    assert list(blocks) == ["outliers", "plane too high", "plane tilted", "accurate"]
+    for block in blocks.values():
+        assert (block["images"], block["targets"]) == (3, 4)
+        rows = {row["name"]: row for row in block["rows"]}
+        assert set(rows) == ALWAYS
+        for row in rows.values():
+            assert row["change_mssd"]["value"] == pytest.approx(row["ar_mssd"] - rows["input"]["ar_mssd"])
+            assert "inside_static_3mm" not in row
+        assert rows["input"]["made_worse"]["value"] == 0
+    high = {row["name"]: row for row in blocks["plane too high"]["rows"]}
+    plain = evaluate(read_estimates(dataset / "est.csv"), BopDataset(dataset))
+    assert high["input"]["ar_mssd"] == plain.ar_mssd
+    assert high["P + C + G"]["others_made_worse"] == high["P + C + G"]["made_worse"]
+    true = {row["name"]: row for row in blocks["accurate"]["rows"]}
+    assert blocks["accurate"]["rows_planted"] == blocks["accurate"]["rows_planted_acting"] == true["input"]["objects"] == 4
+    assert true["input"]["ar_mssd"] == 1
+    assert true["one depth factor"]["made_worse"]["value"] == 1  # 2.4 % of the distance
+    assert (true["input"]["others_objects"], true["input"]["others_made_worse"]) == (0, None)
+    text = capsys.readouterr().out
+    assert all(f"{block['label']}: {block['what']}; in 3 of 3 images, 4 targets" in text for block in blocks.values())
+    assert "differences to the planted input" in text
+    assert max(map(len, text.splitlines())) <= 120
+
+
+def test_rows_that_are_asked_for_are_run_on_planted_failures_too_and_runs_repeat(dataset):
+    more = ("--preset", "lm", "--plant", "false-positive", "--rows", "without C", "--quiet", "--seed", 5)
+    contents = [ablate(dataset, *more)[1] for _ in range(2)]
+    for content in contents:
+        for block in content["planted"]:
+            assert {row["name"] for row in block["rows"]} == {*ALWAYS, "without C"}
+            assert block["rows_planted"] == block["rows_planted_acting"] == 3
+            for row in block["rows"]:
+                del row["ms_per_image"]
+    assert contents[0] == contents[1]
+    assert [block["label"] for block in contents[0]["planted"]] == [
+        "false positive, low score",
+        "false positive, high score",
+    ]
+
+
+def test_a_failure_that_fits_no_image_says_so(dataset, caplog):
+    code, content = ablate(dataset, "--preset", "lm", "--plant", "missing-supporter", "accurate", "--quiet")
+    assert code == 1
+    assert [(block["label"], block["images"], len(block["rows"])) for block in content["planted"]] == [
+        ("missing supporter", 0, 0),
+        ("accurate", 3, 4),
+    ]
+    assert "missing supporter: fits none of 3 images (an object that carries another one is not estimated)" in caplog.text
+    assert len(content["problems"]) == 1
+
+
+def test_a_failure_that_is_unknown_is_refused_with_those_there_are(dataset, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        ablate(dataset, "--plant", "earthquake")
+    assert stopped.value.code == 2
+    assert "missing-supporter" in capsys.readouterr().err

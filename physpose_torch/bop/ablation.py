@@ -5,6 +5,7 @@ import tempfile
 import time
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ from torch import Tensor
 from physpose_torch.ablation import Knowledge, Variant, disturb, with_exact_planes, without_planes
 from physpose_torch.bop.dataset import BopDataset
 from physpose_torch.bop.formats import Estimates
+from physpose_torch.bop.harm import RESAMPLES, Matches, match_acting, mssd_of
 from physpose_torch.bop.metrics import Scores, evaluate
 from physpose_torch.bop.scenes import ImageScene, poses_of
 from physpose_torch.errors import PhysPoseError
@@ -25,8 +27,6 @@ from physpose_torch.scene import Scene
 
 __all__ = ["Ablation", "Batch", "Difference", "Disturbance", "Outcome", "difference", "prepare", "restricted"]
 
-RESAMPLES = 1000
-"""Of the images, for the interval of a difference."""
 MUCH = 3.0
 """[mm]; penetrations and gaps above this count."""
 
@@ -123,6 +123,8 @@ class Outcome:
     physics: dict[str, float | None]
     """Figures of the objects that act, measured with the planes as known; None where there is nothing to measure."""
     ms_per_image: float
+    mssd: np.ndarray
+    """Of the objects in :attr:`Ablation.matches`, to the same instances [m]."""
 
 
 class Ablation:
@@ -138,6 +140,14 @@ class Ablation:
         self.estimates, self.dataset, self.batches = estimates, dataset, batches
         self._done: dict[Any, Outcome] = {}
         self._cold = True
+
+    @cached_property
+    def matches(self) -> Matches:
+        """The estimates that act in some batch, with the ground truth that they are held against."""
+        acts = np.zeros(len(self.estimates), dtype=bool)
+        for batch in self.batches:
+            acts[batch.rows] = acting(batch.scene(), batch.scores).numpy()
+        return match_acting(self.estimates, self.dataset, acts)
 
     def run(self, variant: Variant, on_images: Callable[[int], Any] | None = None) -> Outcome:
         """Poses of a variant, and what they are worth.
@@ -184,7 +194,8 @@ class Ablation:
             on_images(len(batch.images))
         count = sum(len(b.images) for b in self.batches)
         scores = evaluate(self.estimates, self.dataset, poses=poses)
-        return Outcome(poses, scores, _figures(reports), 1000 * seconds / max(count, 1))
+        mssd = mssd_of(self.matches, self.estimates, self.dataset, poses)
+        return Outcome(poses, scores, _figures(reports), 1000 * seconds / max(count, 1), mssd)
 
 
 def _figures(reports: Iterable) -> dict[str, float | None]:

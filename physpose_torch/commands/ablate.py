@@ -4,39 +4,32 @@ import dataclasses
 import json
 import logging
 import math
-import textwrap
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from tqdm import tqdm
 
-from physpose_torch.ablation import Variant, choose, list_variants
-from physpose_torch.bop.ablation import (
-    Ablation,
-    Batch,
-    Difference,
-    Disturbance,
-    Outcome,
-    difference,
-    prepare,
-    restricted,
-)
+from physpose_torch.ablation import Variant, as_estimated, choose, list_variants
+from physpose_torch.bop.ablation import Ablation, Batch, Disturbance, Outcome, prepare, restricted
 from physpose_torch.bop.dataset import BopDataset
 from physpose_torch.bop.formats import Estimates
+from physpose_torch.bop.harm import NOTABLE
+from physpose_torch.bop.planted import plant, true_images
 from physpose_torch.bop.scenes import ImageScene
+from physpose_torch.commands.ablate_table import Row, header, plain, planted_header
 from physpose_torch.commands.common import check_output, progress
 from physpose_torch.commands.images import ImageOptions, in_batches
 from physpose_torch.config import Calibration, RefinerConfig
 from physpose_torch.errors import InvalidInputError, PhysPoseError
+from physpose_torch.losses import acting
+from physpose_torch.planted import Failure, FailureName, choose_failures
 
 __all__ = ["Ablate"]
 
 logger = logging.getLogger("physpose_torch")
-
-WIDTH = 120
-NAME = 33
-"""Characters of a row's name."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,10 +38,17 @@ class Ablate(ImageOptions):
 
     One table: average recalls of MSSD and MSPD over the targets of the images that the file names; the difference of each
     to the reference, which is the preset as it is, in thousandths with its 95 % interval (paired bootstrap: images are
-    drawn with replacement from the file as a whole, all scenes together); how many objects are more than 3 mm inside
-    something static or above their support, and how deep they are in each other, all measured with the planes as known.
-    Images that cannot be refined keep their poses in all rows, are listed at the end, and the exit code is 1; so it is if
-    a row fails.
+    drawn with replacement from the file as a whole, all scenes together); how many objects are made worse, that is, have an
+    MSSD more than 2 mm above that of the input; how many objects are more than 3 mm inside something static or above their
+    support, and how deep they are in each other (95th percentile), all measured with the planes as known. Images that
+    cannot be refined keep their poses in all rows, are listed at the end, and the exit code is 1; so it is if a row fails.
+
+    What is made worse is counted among the estimates that act and are matched with a ground truth instance of their object
+    in their image, by the smallest MSSD of the input, each instance and each estimate once; the match stays whatever a row
+    makes of the poses. Its interval is a bootstrap over the same images.
+
+    With --plant, failures are planted into the estimates first: a table for each, over the images that it fits, of how much
+    each row gains on the planted input. The targets are the same as without.
     """
 
     calibration: Path | None = None
@@ -57,12 +57,18 @@ class Ablate(ImageOptions):
     """Only these rows, by name, beside the baselines and the reference. An unknown name lists them all."""
     slow: bool = False
     """Run the slow rows, too."""
+    plant: tuple[FailureName, ...] = ()
+    """Plant these failures, each on its own, and compare the baselines, the reference and ROWS on them. false-positive: a
+    body that is not there in the middle of the others, once with a low and once with a high score; duplicate: a second
+    estimate of an object, and no targets file tells that there is one; missing-supporter: no estimate of an object that
+    carries another; depth-order: two neighbours with their depths swapped; outliers: 30 % of the objects grossly wrong;
+    wrong-plane: once 2 cm too high, once tilted by 8°; accurate: ground truth with 1 mm and 0.5° of noise as the input."""
     disturb_deg: float = 1.5
     """Disturbed planes: standard deviation of the tilt about each of two axes. The refiner is told."""
     disturb_mm: float = 6.0
     """Disturbed planes: standard deviation of the height."""
     seed: int = 0
-    """Seed of the disturbed planes and of the bootstrap."""
+    """Seed of the disturbed planes, of what is planted and of the bootstrap."""
     preset: str = "default"
     """default; lm: the same cost by fifteen Gauss-Newton steps; or paper: the paper's cost, weights and plain descent, slow."""
     config: RefinerConfig = field(default_factory=RefinerConfig)
@@ -74,7 +80,7 @@ class Ablate(ImageOptions):
 
     def __call__(self) -> int:
         check_output(self.json)
-        variants = self._variants()
+        variants, failures = self._variants(), choose_failures(self.plant)
         estimates, dataset, total, todo = self.open()
         images: list[ImageScene] = []
         batches: list[Batch] = []
@@ -87,21 +93,31 @@ class Ablate(ImageOptions):
         looked_at = {(i.scene_id, i.im_id) for i in images}
         if not looked_at:
             raise InvalidInputError(f"{self.estimates}: no images to compare; check --scenes, or the file")
-        ablation = Ablation(estimates, restricted(dataset, looked_at), batches)
         count = sum(len(b.images) for b in batches)
-        with progress(count * (len(variants) + 1), "ablate", "image", quiet=self.quiet) as bar:
-            bar.leave = False
-            results = self._run(ablation, variants, bar)
-        skipped = [v.name for v in self._all_variants() if v.slow and v not in variants and not self.rows]
+        part = restricted(dataset, looked_at)
         problems = [p for i in images for p in i.problems]
+        if failures:
+            listed = dataset.targets if dataset.targets_path is not None else []  # never from the ground truth
+            counts = {t[:3]: t.inst_count for t in listed}
+            planted = list(self._planted(failures, variants, images, estimates, part, counts))
+            problems += [p for block in planted for p in block.pop("problems")]
+            content = {"planted": planted}
+            failed = any(row["error"] for block in planted for row in block["rows"])
+        else:
+            rows = self._run(Ablation(estimates, part, batches), variants, header(), Row.line)
+            content = {"rows": [row.to_dict() for row in rows]}
+            failed = any(row.error for row in rows)
+        skipped = [v.name for v in self._all_variants() if v.slow and v not in variants]
+        skipped = [] if self.rows or self.plant else skipped
         if self.json is not None:
-            content = self._content(results, estimates, ablation.dataset, len(looked_at), count, skipped, problems)
+            content = self._options(estimates, part, len(looked_at), count) | content
+            content |= {"skipped": skipped, "problems": problems}
             self.json.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
         if not self.quiet:
-            print("", *self._notes(ablation.dataset, len(looked_at), count, skipped), sep="\n")
+            print("", *self._notes(part, len(looked_at), count, skipped), sep="\n")
         for problem in problems:
             logger.error(problem)
-        return 1 if problems or any(r.error for r in results) else 0
+        return 1 if problems or failed else 0
 
     @property
     def _disturbance(self) -> Disturbance:
@@ -120,7 +136,8 @@ class Ablate(ImageOptions):
             if not getattr(self, name) >= 0:
                 option = "--" + name.replace("_", "-")
                 raise InvalidInputError(f"{option} {getattr(self, name)}: expected a number >= 0")
-        return choose(self._all_variants(), self.rows, slow=self.slow)
+        chosen = choose(self._all_variants(), self.rows, slow=self.slow)
+        return [v for v in chosen if v.always or self.rows or not self.plant]
 
     def _calibration(self) -> Calibration | None:
         if self.calibration is None:
@@ -129,45 +146,97 @@ class Ablate(ImageOptions):
 
         return read_calibration(self.calibration)
 
-    def _run(self, ablation: Ablation, variants: list[Variant], bar: tqdm) -> "list[_Result]":
-        """All rows in the order of the table, each printed as soon as it is known; the reference is worked out first."""
-        reference = None
-        wanted = next(v for v in variants if v.key == (self.config, None, "known"))
-        if not self.quiet:
-            bar.write(_header())
-        bar.set_description(wanted.name)
-        try:
-            reference = ablation.run(wanted, bar.update)
-        except PhysPoseError:
-            bar.update(0)  # its row will tell
-        results: list[_Result] = []
-        for variant in variants:
-            bar.set_description(variant.name)
-            try:
-                result = _Result.of(variant, ablation.run(variant, bar.update), reference, self.seed)
-            except PhysPoseError as error:
-                result = _Result(variant, error=str(error))
-            if not self.quiet:
-                if not results or results[-1].variant.group != variant.group:
-                    bar.write(f"\n{variant.group}")
-                bar.write(result.line())
-            results.append(result)
-        return results
-
-    def _content(
+    def _run(
         self,
-        results: "list[_Result]",
+        ablation: Ablation,
+        variants: list[Variant],
+        head: str,
+        line: Callable[[Row], str],
+        *,
+        touched: np.ndarray | None = None,
+    ) -> list[Row]:
+        """All rows in the order of the table, each printed as soon as it is known; the reference is worked out first."""
+        wanted = next(v for v in variants if v.key == (self.config, None, "known"))
+        count = sum(len(b.images) for b in ablation.batches)
+        rows: list[Row] = []
+        with progress(count * (len(variants) + 2), "ablate", "image", quiet=self.quiet) as bar:
+            bar.leave = False
+            if not self.quiet:
+                bar.write(head)
+            estimated = next(v for v in variants if v.baseline is as_estimated)
+            measured, reference = (self._worked_out(ablation, v, bar) for v in (estimated, wanted))
+            for variant in variants:
+                bar.set_description(variant.name)
+                try:
+                    outcome = ablation.run(variant, bar.update)
+                    compare = {"reference": reference, "measured": measured, "touched": touched, "seed": self.seed}
+                    row = Row.of(variant, outcome, ablation, **compare)
+                except PhysPoseError as error:
+                    row = Row(variant, error=str(error))
+                if not self.quiet:
+                    if not rows or rows[-1].variant.group != variant.group:
+                        bar.write(f"\n{variant.group}")
+                    bar.write(line(row))
+                rows.append(row)
+        return rows
+
+    @staticmethod
+    def _worked_out(ablation: Ablation, variant: Variant, bar: tqdm) -> Outcome | None:
+        bar.set_description(variant.name)
+        try:
+            return ablation.run(variant, bar.update)
+        except PhysPoseError:
+            return None  # its row will tell
+
+    def _planted(
+        self,
+        failures: list[Failure],
+        variants: list[Variant],
+        images: list[ImageScene],
         estimates: Estimates,
         dataset: BopDataset,
-        looked_at: int,
-        used: int,
-        skipped: list[str],
-        problems: list[str],
-    ) -> dict[str, Any]:
+        counts: dict[tuple[int, int, int], int],
+    ) -> Iterator[dict[str, Any]]:
+        """A block for each failure, ready for JSON, printed on the way."""
+        known = true_images(images, estimates, dataset)
+        for failure in failures:
+            planted = plant(failure, known, estimates, counts=counts, seed=self.seed)
+            batches = [
+                batch
+                for some in in_batches(planted.images, self.batch)
+                for batch in prepare(some, planted.estimates, self._disturbance)
+            ]
+            problems = [f"{failure.label}: {p}" for i in planted.images for p in i.problems]
+            if not planted.images:
+                problems.append(f"{failure.label}: fits none of {len(known.images)} images ({failure.what})")
+            there = {(i.scene_id, i.im_id) for i in planted.images}
+            part = restricted(dataset, there)
+            targets = sum(t.inst_count for t in part.targets)
+            block = {
+                "name": failure.name,
+                "label": failure.label,
+                "what": failure.what,
+                "images": len(there),
+                "rows_planted": int(planted.touched.sum()),
+                "rows_planted_acting": sum(
+                    int((acting(b.scene(), b.scores).numpy() & planted.touched[b.rows]).sum()) for b in batches
+                ),
+                "targets": targets,
+                "rows": [],
+                "problems": problems,
+            }
+            if batches:
+                title = f"{failure.label}: {failure.what}; in {len(there)} of {len(known.images)} images, {targets} targets"
+                ablation = Ablation(planted.estimates, part, batches)
+                rows = self._run(ablation, variants, planted_header(title), Row.planted_line, touched=planted.touched)
+                block["rows"] = [row.to_dict() for row in rows]
+            yield block
+
+    def _options(self, estimates: Estimates, dataset: BopDataset, looked_at: int, used: int) -> dict[str, Any]:
         in_file = len(set(zip(estimates.scene_id.tolist(), estimates.im_id.tolist(), strict=True)))
         options = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "config"}
         return {
-            "options": {**_plain(options), "config": _plain(dataclasses.asdict(self.config))},
+            "options": {**plain(options), "config": plain(dataclasses.asdict(self.config))},
             "images": {
                 "in_file": in_file,
                 "looked_at": looked_at,
@@ -175,16 +244,15 @@ class Ablate(ImageOptions):
                 "share": looked_at / max(in_file, 1),
             },
             "targets": sum(t.inst_count for t in dataset.targets),
-            "rows": [r.to_dict() for r in results],
-            "skipped": skipped,
-            "problems": problems,
+            "made_worse_above_mm": 1000 * NOTABLE,
         }
 
     def _notes(self, dataset: BopDataset, looked_at: int, used: int, skipped: list[str]) -> list[str]:
         targets = sum(t.inst_count for t in dataset.targets)
         left = f", {looked_at - used} of them kept as they are" if used < looked_at else ""
+        to = "to the planted input " if self.plant else ""
         notes = [
-            f"{looked_at} images{left}, {targets} targets; differences in thousandths, with 95 % intervals over images"
+            f"{looked_at} images{left}, {targets} targets; differences {to}in thousandths, with 95 % intervals over images"
         ]
         if self.calibration is None:
             notes.append(
@@ -193,92 +261,3 @@ class Ablate(ImageOptions):
         if skipped:
             notes.append(f"Left out because they are slow: {', '.join(skipped)}; see --slow and --rows")
         return notes
-
-
-@dataclass(frozen=True)
-class _Result:
-    """A row of the table."""
-
-    variant: Variant
-    outcome: Outcome | None = None
-    mssd: Difference | None = None
-    mspd: Difference | None = None
-    error: str = ""
-
-    @classmethod
-    def of(cls, variant: Variant, outcome: Outcome, reference: Outcome | None, seed: int) -> "_Result":
-        if reference is None:
-            return cls(variant, outcome)
-        changes = (difference(outcome.scores, reference.scores, e, seed=seed) for e in ("ar_mssd", "ar_mspd"))
-        return cls(variant, outcome, *changes)
-
-    def line(self) -> str:
-        name = self.variant.shown
-        if self.outcome is None:
-            first, rest = f"{name:<{NAME}}  failed: ", " " * (NAME + 2)
-            return textwrap.fill(self.error, WIDTH, initial_indent=first, subsequent_indent=rest)
-        p, s = self.outcome.physics, self.outcome.scores
-        ms = f"{self.outcome.ms_per_image:.0f}" if self.variant.config is not None else "-"
-        return _line(
-            name,
-            f"{s.ar_mssd:.3f}",
-            _thousandths(self.mssd),
-            f"{s.ar_mspd:.3f}",
-            _thousandths(self.mspd),
-            _number(p["inside_static_3mm"], 100, 0),
-            _number(p["above_support_3mm"], 100, 0),
-            _number(p["penetration_object_median_mm"], 1, 1),
-            _number(p["penetration_object_p95_mm"], 1, 1),
-            ms,
-        )
-
-    def to_dict(self) -> dict[str, Any]:
-        v, o = self.variant, self.outcome
-        content: dict[str, Any] = {
-            "name": v.name,
-            "label": v.shown,
-            "group": v.group,
-            "planes": v.knowledge,
-            "config": None if v.config is None else _plain(dataclasses.asdict(v.config)),
-            "error": self.error or None,
-        }
-        if o is not None:
-            content |= {"ar_mssd": o.scores.ar_mssd, "ar_mspd": o.scores.ar_mspd, **o.physics}
-            content["ms_per_image"] = o.ms_per_image
-            for name, change in (("difference_mssd", self.mssd), ("difference_mspd", self.mspd)):
-                content[name] = None if change is None else change._asdict()
-        return content
-
-
-def _line(name: str, *cells: str) -> str:
-    widths = (5, 17, 5, 17, 4, 5, 6, 4, 6)
-    return "  ".join([f"{name:<{NAME}}", *(f"{c:>{w}}" for c, w in zip(cells, widths, strict=True))]).rstrip()
-
-
-def _header() -> str:
-    over, overlap = f"{'over 3 mm [%]':>13}", f"{'overlap [mm]':>12}"
-    recalls = "  ".join(f"{name:<7}{'Δ·10³ [95 %]':>17}" for name in ("AR_MSSD", "AR_MSPD"))
-    below = "  ".join([f"{'in':>4}", "above", "median", "95 %", " image"])
-    return "\n".join([f"{'':{NAME + 52}}{over}  {overlap}  ms per", f"{'':{NAME}}  {recalls}  {below}", "-" * WIDTH])
-
-
-def _thousandths(d: Difference | None) -> str:
-    if d is None:
-        return "-"
-    value, low, high = (f"{n:+d}" if n else "0" for n in (round(1000 * x) for x in d))
-    return f"{value} [{low}, {high}]"
-
-
-def _number(x: float | None, factor: float, digits: int) -> str:
-    return "-" if x is None else f"{factor * x:.{digits}f}"
-
-
-def _plain(value: Any) -> Any:
-    """The same for JSON: paths and infinities as text."""
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, Path) or (isinstance(value, float) and not math.isfinite(value)):
-        return str(value)
-    return value
