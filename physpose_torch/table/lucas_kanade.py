@@ -56,12 +56,10 @@ def gray(image: Tensor) -> Tensor:
 
 def sample(image: Tensor, points: Tensor, mode: str = "bilinear") -> Tensor:
     """Values (...) of an image (H, W) at points (..., 2) [px], pixel centres at integers; the border goes on outside."""
-    if mode == "bicubic":  # torch's kernel (A = -0.75) puts a ramp at t + t (1 - t) (1 - 2 t) / 2
+    if mode == "bicubic":
+        # torch's kernel (A = -0.75) puts a ramp at t + t (1 - t) (1 - 2 t) / 2; the cubic equation for t has this solution
         low = points.floor()
-        wanted = part = points - low
-        for _ in range(4):
-            part = wanted - 0.5 * part * (1 - part) * (1 - 2 * part)
-        points = low + part
+        points = low + (0.5 + (((points - low).to(image.dtype) * 4 - 2).asinh() / 3).sinh())
     size = points.new_tensor([image.shape[1] - 1, image.shape[0] - 1])
     grid = (2.0 * points / size - 1.0).to(image.dtype).reshape(1, 1, -1, 2)
     value = grid_sample(image[None, None], grid, mode=mode, padding_mode="border", align_corners=True)
@@ -132,8 +130,9 @@ def _align(image_0: Tensor, image_1: Tensor, points_0: Tensor, points_1: Tensor,
 
     at = points_0[:, None] + offset
     template = sample(image_0, at, "bicubic")
-    step = torch.eye(2, dtype=at.dtype, device=at.device)
-    slope = torch.stack([(sample(image_0, at + s, "bicubic") - sample(image_0, at - s, "bicubic")) / 2 for s in step], -1)
+    wide = pad(image_0[None, None], (1,) * 4, mode="replicate")[0, 0]
+    slopes = (wide[1:-1, 2:] - wide[1:-1, :-2]) / 2, (wide[2:, 1:-1] - wide[:-2, 1:-1]) / 2
+    slope = torch.stack([sample(image, at, "bicubic") for image in slopes], -1)
     # how the patch changes with position and map; what a change of brightness or contrast would explain is projected out
     by_map = (slope[..., :, None] * offset.float()[:, None, :]).flatten(-2)
     steepest = torch.cat([slope, by_map / HALF_WINDOW], -1) if deform else slope
