@@ -99,10 +99,18 @@ class Fit(NamedTuple):
     """(G,) squared length of each term's whitened rows."""
 
 
-def adjust(state: State, terms: Sequence[Term], schedule: Sequence[float]) -> Fit:
-    """Minimise the robust cost of the terms, from a start."""
+def adjust(state: State, terms: Sequence[Term], schedule: Sequence[float], *, widest: float = 1.0) -> Fit:
+    """Minimise the robust cost of the terms, from a start.
+
+    Args:
+        state: where to start.
+        terms: the evidence.
+        schedule: scales of the robust weights, one a step.
+        widest: largest of them for terms with a cap. Seen from farther than one, what is truly elsewhere is pulled in and
+            stays; where nothing else could tell what is elsewhere, it is found from farther away.
+    """
     for scale in schedule:
-        matrix, gradient, _, _ = _normal_equations(state, terms, scale)
+        matrix, gradient, _, _ = _normal_equations(state, terms, scale, min(scale, widest))
         state = _moved(state, -torch.linalg.solve(matrix, gradient).clamp(-LARGEST_STEP, LARGEST_STEP))
     matrix, _, cost, surprise = _normal_equations(state, terms, 1.0)
     given = [i for i in range(len(matrix)) if i != FACTOR]
@@ -146,7 +154,7 @@ def _moved(state: State, step: Tensor) -> State:
     )
 
 
-def _normal_equations(state: State, terms: Sequence[Term], scale: float):
+def _normal_equations(state: State, terms: Sequence[Term], scale: float, capped: float = 1.0):
     """Gauss–Newton matrix and gradient, the cost at scale one, and every row's squared length."""
     n = len(state.poses)
     columns = SHARED + 6
@@ -165,7 +173,7 @@ def _normal_equations(state: State, terms: Sequence[Term], scale: float):
         J = (torch.stack(moved, -1) - r[..., None]) / DIFFERENCE
         squared = (r**2).sum(1)
         surprise.append(squared)
-        weight, loss = _robust(squared, r.shape[1], term, scale)
+        weight, loss = _robust(squared, r.shape[1], term, scale, capped)
         cost += float((term.weight * loss).sum()) + getattr(term, "cost", 0.0)
         weight = weight * term.weight
         weighted = weight[:, None, None] * J
@@ -187,12 +195,11 @@ def _normal_equations(state: State, terms: Sequence[Term], scale: float):
     return matrix + torch.diag(ridge), torch.cat([gradient, gradient_own.flatten()]), cost, tuple(surprise)
 
 
-def _robust(squared: Tensor, dimensions: int, term: Term, scale: float) -> tuple[Tensor, Tensor]:
-    """Weights at a scale, and losses at scale one, of rows with these squared lengths."""
+def _robust(squared: Tensor, dimensions: int, term: Term, scale: float, capped: float) -> tuple[Tensor, Tensor]:
+    """Weights at a scale (``capped`` for terms with a cap), and losses at scale one, of rows with these squared lengths."""
     if term.cap is not None:
-        # at scale one from the start: seen from farther, what is truly elsewhere would be pulled in and stay
         limit = 2.0 * term.cap
-        return (limit / (limit + squared)) ** 2, 0.5 * squared * limit / (limit + squared)
+        return (limit / (limit + squared / capped**2)) ** 2, 0.5 * squared * limit / (limit + squared)
     if term.nu == float("inf"):
         return torch.ones_like(squared), 0.5 * squared
     weight = (term.nu + dimensions) / (term.nu + squared / scale**2)

@@ -37,6 +37,8 @@ STANDS = 16.0
 """Squared deviation of the feet of an object that stands, in standard deviations of contacts; about three count."""
 FITS = 9.0
 """The same of a match that is where it should be."""
+WIDEST = 3.0
+"""Scale from which contacts are looked for by the poses alone, where nothing else could contradict them."""
 HOPELESS = 40.0
 """A plane whose cost by the poses alone is this much higher will not be the table."""
 SAME_MOTION = (math.radians(1.0), 0.1)
@@ -95,7 +97,8 @@ def fit_support(problem: Problem, motion: Tensor | None = None) -> list[Supporte
     for guess in plane_hypotheses(problem.bodies, poses, problem.config, gravity=problem.gravity):
         state = State(eye if motion is None else motion, filled, guess.normal, guess.offset, one, middle)
         for schedule in (ROUGH, FINE):
-            state = adjust(state, _pose_terms(problem, state, two=motion is not None), schedule).state
+            terms = _pose_terms(problem, state, two=motion is not None)
+            state = adjust(state, terms, schedule, widest=WIDEST).state
         terms = _pose_terms(problem, state, two=motion is not None)
         fits.append(_supported(problem, adjust(state, terms, ()), terms))
     return sorted(fits, key=lambda fit: fit.cost)

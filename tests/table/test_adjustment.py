@@ -196,8 +196,8 @@ def residuals(term, state):
     return term.residual(unknowns_at(state))[0]
 
 
-@pytest.mark.parametrize("scale", [1.0, 3.0])
-def test_the_normal_equations_are_those_of_all_rows_and_all_unknowns(scene, scale):
+@pytest.mark.parametrize(("scale", "capped"), [(1.0, 1.0), (3.0, 1.0), (3.0, 2.0)])
+def test_the_normal_equations_are_those_of_all_rows_and_all_unknowns(scene, scale, capped):
     """Against central differences of whole states, object by object, and weights written out."""
     start = scene.start(shift=0.003, turn=0.008)
     terms = [*scene.some(*ALL), scene.terms["upright"]]
@@ -211,7 +211,7 @@ def test_the_normal_equations_are_those_of_all_rows_and_all_unknowns(scene, scal
         J = torch.stack([(residuals(term, a) - residuals(term, b)) / (2 * h) for a, b in moved], -1)
         squared = (r**2).sum(1)
         if term.cap is not None:
-            share = 2 * term.cap / (2 * term.cap + squared)
+            share = 2 * term.cap / (2 * term.cap + squared / capped**2)
             weight, cost = share**2, term.cap * squared / (2 * term.cap + squared)
         elif math.isinf(term.nu):
             weight, cost = torch.ones_like(squared), 0.5 * squared
@@ -222,7 +222,7 @@ def test_the_normal_equations_are_those_of_all_rows_and_all_unknowns(scene, scal
         matrix += torch.einsum("gki,g,gkj->ij", J, weight, J)
         gradient += torch.einsum("gki,g,gk->i", J, weight, r)
         total += float((cost * term.weight).sum()) + getattr(term, "cost", 0.0)
-    found, pull, cost, surprise = _normal_equations(start, terms, scale)
+    found, pull, cost, surprise = _normal_equations(start, terms, scale, capped)
     scales = matrix.diagonal().sqrt()
     torch.testing.assert_close(found / scales / scales[:, None], matrix / scales / scales[:, None], atol=1e-4, rtol=0)
     torch.testing.assert_close(pull / scales, gradient / scales, atol=2e-3, rtol=1e-4)
