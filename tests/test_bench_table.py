@@ -41,7 +41,8 @@ def estimate_of(plane, poses, warnings=()):
     nothing = {"method": "support", "scale": None, "inliers": 0, "warnings": warnings, "depth_factor": 1.0}
     none = torch.zeros(0, 3, dtype=torch.float64)
     standing = torch.ones(len(poses), dtype=torch.bool)
-    return TableEstimate(plane, T_view1_view0=None, poses=poses, standing=standing, contacts=none, **nothing)
+    covariance = plane.covariance
+    return TableEstimate(plane, covariance, T_view1_view0=None, poses=poses, standing=standing, contacts=none, **nothing)
 
 
 # ---- errors of the poses

@@ -32,6 +32,8 @@ RIVAL = 5.0
 DISAGREE = 7.0
 """Squared deviation of the typical object from its estimate across the viewing ray, 2 in the mean if all is well; above this,
 something is wrong with all of them."""
+IMPLAUSIBLE = 16.0
+"""The same of the depth factor that all poses share."""
 FEW_MATCHES = 8
 """Fewer matches on the table than this say little of it."""
 
@@ -194,7 +196,9 @@ class TableEstimator:
             solution = fit_joint(problem, lambda *images: None)
         if solution is None:
             raise TableNotFoundError("no object has a shape and a pose with which it could stand on something")
-        if solution.disagreement > DISAGREE:
+        # what the images say of all distances together, against what was believed of them
+        off = ((float(solution.fit.state.depth_factor) - 1.0) / self.config.sigma_depth_common) ** 2
+        if solution.disagreement > DISAGREE or off > IMPLAUSIBLE:
             # images that contradict all poses belong to other poses, or to another camera
             warnings.append(
                 "images and estimated poses contradict each other (wrong intrinsics, or poses of another image?): "
@@ -204,7 +208,7 @@ class TableEstimator:
             if not fits:
                 raise TableNotFoundError("images and estimated poses contradict each other; check the intrinsics")
             rival = rival_cost(fits)
-            worse = solution.disagreement / 2.0
+            worse = max(solution.disagreement, off) / 2.0
             fit = fits[0]._replace(covariance=fits[0].covariance * worse, relative=fits[0].relative * worse)
             return self._of_fit(problem, fit, "support", rival, None, warnings, two=False)
         two = solution.two
