@@ -102,6 +102,7 @@ def _jacobian(measured: Tensor, s: Solution, rank: Tensor, size: int, *, of: str
     """
     n = len(rank)
     out = measured.new_zeros(n, 6, size, 6)
+    estimates = _prior_poses(measured, s)
     moves = [(k, axis, sign) for k in range(size) for axis in range(6) for sign in (1, -1)]
     at_once = max(MOST_COPIES // max(n, 1) // 2, 1) * 2
     for start in range(0, len(moves), at_once):
@@ -109,7 +110,7 @@ def _jacobian(measured: Tensor, s: Solution, rank: Tensor, size: int, *, of: str
         step = measured.new_zeros(len(part), n, 6)
         for c, (k, axis, sign) in enumerate(part):
             step[c, (rank == k).to(step.device), axis] = sign * STEP[axis >= 3]
-        x, m = s.poses.expand(len(part), n, 4, 4), _prior_poses(measured, s).expand(len(part), n, 4, 4)
+        x, m = (T.expand(len(part), n, 4, 4) for T in (s.poses, estimates))
         if of == "poses":
             x = se3.retract(x, step)
         else:
