@@ -15,7 +15,7 @@ _HOMES = {
         "TableNotFoundError",
         "UnknownLabelError",
     ],
-    "config": ["Calibration", "PhysicsConfig", "RefinerConfig", "Smoothing", "TableConfig"],
+    "config": ["Calibration", "Caution", "PhysicsConfig", "RefinerConfig", "Smoothing", "TableConfig"],
     "geometry.convex": ["ConvexParts"],
     "geometry.decompose": ["DecomposeOptions"],
     "geometry.body": ["Body", "Plane"],

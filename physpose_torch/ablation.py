@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from physpose_torch.config import Calibration, RefinerConfig
+from physpose_torch.config import Calibration, Caution, RefinerConfig
 from physpose_torch.contacts import object_heights
 from physpose_torch.distance.smoothing import tangent_basis
 from physpose_torch.errors import InvalidInputError
@@ -41,6 +41,7 @@ MEGAPOSE_FACTOR = 0.976
 BASELINES = "Baselines"
 TERMS = "Cost terms (paper, Table 3)"
 SCENE = "Scene knowledge (paper, Table 2)"
+CAUTION = "Caution (what keeps estimates from being made worse)"
 CHOICES = "Other choices"
 
 
@@ -250,8 +251,23 @@ def list_variants(
         ]
     rows.append(Variant("known scene", SCENE, config, label="known scene (= reference)"))
 
+    def careless(name: str, caution: Caution) -> None:
+        changed = replace(config, caution=caution)
+        if changed not in [row.config for row in rows]:
+            rows.append(Variant(name, CAUTION, changed))
+
+    caution = config.caution
+    careless("all push", replace(caution, conflict=math.inf))
+    careless("none released", replace(caution, release=math.inf))
+    careless("unsupported follow", replace(caution, unsupported="follow"))
+    careless("usual accuracy", replace(caution, least_sigma=1.0))
+    careless("no doubt", replace(caution, doubt=math.inf))
+    careless("without caution", Caution.off())
+
     for form in ("support", "paper"):
         change(f"gravity {form}", gravity=form)
+    change("not flush", sigma_flush=math.inf)
+    change("strict contacts", sigma_contact=0.0)
     for kind in ("ring", "gaussian", "gumbel", "none"):
         change(f"smoothing {kind}", smoothing=replace(physics.smoothing, kind=kind), slow=kind == "gumbel")
     change("no common depth factor", sigma_depth_common=0.0)

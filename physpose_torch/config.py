@@ -7,7 +7,7 @@ from typing import Literal
 
 from physpose_torch.errors import InvalidInputError
 
-__all__ = ["STILL_STEPS", "Calibration", "PhysicsConfig", "RefinerConfig", "Smoothing", "TableConfig"]
+__all__ = ["STILL_STEPS", "Calibration", "Caution", "PhysicsConfig", "RefinerConfig", "Smoothing", "TableConfig"]
 
 STILL_STEPS = 10
 """An image stops after this many steps of a descent on end without motion."""
@@ -90,11 +90,14 @@ class PhysicsConfig:
     """Standard deviation of an estimate along its viewing ray [m], a constant part."""
     sigma_ray_fraction: float = 0.01
     """The part of it that grows with range: RGB estimators misjudge size and depth by a factor."""
-    sigma_depth_common: float = 0.025
+    sigma_depth_common: float = 0.02
     """Standard deviation of the depth factor that all estimates of one image share; 0: errors are independent. Objects in
     contact with the table then correct the depth of those that are not. Only where something static is known."""
     sigma_rotation: float = 0.026
     """Standard deviation of an estimate's rotation per axis [rad]: 1.5°. A looser one soaks up depth error as tilt."""
+    sigma_flush: float = 0.04
+    """Standard deviation per axis [rad] of the tilt at which things stand: 2.3°. An estimate of an object on a plane that is
+    nearly in a stable pose is joined with that; infinite: it is not. By the refiner only."""
     robust: float = 4.0
     """ν of the robust pose cost ½ ν log(1 + m²/ν), m the Mahalanobis distance: an estimate that physics contradicts by
     more than √ν σ is believed less and less; infinite: the paper's ½ m²."""
@@ -114,6 +117,10 @@ class PhysicsConfig:
     """An object nearer than this to anything [m] counts as touching it, which switches its gravity off (δ in the paper)."""
     softness: float = 5e-4
     """Penetrations and gaps below this [m] cost quadratically, so that contacts settle; 0 is the paper's hinge."""
+    sigma_contact: float = 0.003
+    """Standard deviation of the gap between two objects in contact [m]: scans, their convex parts and true poses agree no
+    better. Contacts among objects are as soft, and some of what overlaps stays; 0: no softer than others, for robots that must
+    not collide. Statics are as sure as their planes say."""
     smoothing: Smoothing = Smoothing()
     """Randomized smoothing of the distance gradients."""
     backend: str = "auto"
@@ -122,6 +129,10 @@ class PhysicsConfig:
     def __post_init__(self) -> None:
         _check_positive(self, "sigma_lateral", "sigma_rotation", "gravity_reach")
         _check_factor(self)
+        if not self.sigma_flush > 0:
+            raise InvalidInputError(
+                f"PhysicsConfig.sigma_flush = {self.sigma_flush}, expected a positive angle [rad] or infinity"
+            )
         if not self.robust > 0:
             raise InvalidInputError(f"PhysicsConfig.robust = {self.robust}, expected a positive number or infinity")
         for name in (
@@ -133,6 +144,7 @@ class PhysicsConfig:
             "gravity_weight",
             "contact_tolerance",
             "softness",
+            "sigma_contact",
         ):
             if not getattr(self, name) >= 0:
                 raise InvalidInputError(f"PhysicsConfig.{name} = {getattr(self, name)}, expected a number >= 0")
@@ -143,11 +155,48 @@ class PhysicsConfig:
 
 
 @dataclass(frozen=True)
+class Caution:
+    """How the refiner keeps from making estimates worse. Each of these can be switched off; see :meth:`off`."""
+
+    conflict: float = 0.02
+    """Of bodies that lie deeper in one another than this [m] where planes put them, the least likely ones push nobody: false
+    detections, mostly. True poses of real data overlap by up to 14 mm. Infinite: all push."""
+    release: float = 3.0
+    """An estimate that would have to move by more than this many σ, and still would not come to rest, is released: it keeps
+    its pose and is reported as rejected. Supports are not looked for farther down either. Infinite: never."""
+    unsupported: Literal["stay", "follow"] = "stay"
+    """What becomes of objects under which nothing known is within reach. ``stay``: they keep their poses. ``follow``: they
+    share the depth factor of the others, which is right for what something unseen carries, and wrong for wrong estimates."""
+    least_sigma: float = 0.2
+    """Estimates that agree with the scene better than is usual are taken to be more accurate: their σ along the ray and in
+    rotation shrink, image by image, down to this share. 1: they do not."""
+    doubt: float = 2.0
+    """An image is left as it is where its objects together contradict what is known of it by more than this many σ, in depth or
+    in tilt: a wrong plane, wrong units, an estimator that is far off. Infinite: never."""
+
+    def __post_init__(self) -> None:
+        for name in ("conflict", "release", "doubt"):
+            if not getattr(self, name) > 0:
+                raise InvalidInputError(f"Caution.{name} = {getattr(self, name)}, expected a positive number or infinity")
+        if not 0 < self.least_sigma <= 1:
+            raise InvalidInputError(f"Caution.least_sigma = {self.least_sigma}, expected a share from 0 to 1, 1 included")
+        if self.unsupported not in ("stay", "follow"):
+            raise InvalidInputError(f"Caution.unsupported = {self.unsupported!r}, expected 'stay' or 'follow'")
+
+    @classmethod
+    def off(cls) -> "Caution":
+        """None at all: every estimate is refined, and pushes, come what may."""
+        return cls(math.inf, math.inf, "follow", 1.0, math.inf)
+
+
+@dataclass(frozen=True)
 class RefinerConfig:
     """How the cost is minimised."""
 
     physics: PhysicsConfig = PhysicsConfig()
     """The cost."""
+    caution: Caution = Caution()
+    """What keeps it from making estimates worse."""
     start: Literal["slide", "measured"] = "slide"
     """Where to start: ``slide``: estimates that lie in a plane start where their viewing ray leads out of it, which is where
     most of them end and brings grossly sunken ones within reach. ``measured``: at the estimates, as in the paper."""
@@ -156,7 +205,7 @@ class RefinerConfig:
     no farther than this [rad] and refined once more; 0: never. Estimates that wrong are mostly of the wrong side."""
     solver: Literal["descent", "lm"] = "descent"
     """``descent``: a first-order torch.optim optimizer. ``lm``: damped Gauss-Newton steps (Levenberg-Marquardt)."""
-    damping: float = 3.0
+    damping: float = 1.0
     """lm: added to the curvature; that of an estimate by itself is 1 or more in each direction."""
     optimizer: Literal["adam", "sgd"] = "adam"
     """torch.optim.Adam on steps scaled by each estimate's σ, or plain gradient descent (the paper's)."""
@@ -201,7 +250,7 @@ class RefinerConfig:
             raise InvalidInputError(f"RefinerConfig.tolerance = {self.tolerance}, expected a number >= 0 [m]")
 
     def calibrated(self, calibration: Calibration) -> "RefinerConfig":
-        """The same with an estimator's own bias and spread in place of the usual ones."""
+        """The same with an estimator's own bias and spread in place of the usual ones, which need no guessing then."""
         c = calibration
         physics = replace(
             self.physics,
@@ -212,12 +261,12 @@ class RefinerConfig:
             sigma_lateral=c.sigma_lateral,
             sigma_rotation=c.sigma_rotation,
         )
-        return replace(self, physics=physics)
+        return replace(self, physics=physics, caution=replace(self.caution, least_sigma=1.0))
 
     @classmethod
     def lm(cls) -> "RefinerConfig":
         """The default cost, minimised by fifteen Gauss-Newton steps instead of forty of Adam's."""
-        return cls(solver="lm", steps=15, learning_rate=0.5)
+        return cls(solver="lm", steps=15, learning_rate=0.7)
 
     @classmethod
     def paper(cls) -> "RefinerConfig":
@@ -228,6 +277,8 @@ class RefinerConfig:
             sigma_ray_fraction=0.0,
             sigma_depth_common=0.0,
             sigma_rotation=0.26,
+            sigma_flush=math.inf,
+            sigma_contact=0.0,
             collision_weight=1.0,
             gravity_weight=1.0,
             gravity="paper",
@@ -237,6 +288,7 @@ class RefinerConfig:
         )
         return cls(
             physics,
+            caution=Caution.off(),
             start="measured",
             righting=0.0,
             optimizer="sgd",

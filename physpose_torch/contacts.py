@@ -116,7 +116,7 @@ def find_drops(
     scene: Scene,
     *,
     acts: Tensor | None = None,
-    reach: float,
+    reach: Tensor | float,
     smoothing: Smoothing | None = None,
     backend: str = "auto",
 ) -> Drops:
@@ -126,12 +126,13 @@ def find_drops(
 
     Args:
         poses, scene, acts, smoothing, backend: as in :func:`find_contacts`.
-        reach: longer falls [m] count as endless.
+        reach: longer falls [m] count as endless; one for all, or (N,).
     """
     n, device = len(scene), poses.device
     acts = _all_act(scene, acts)
     T = scene.entity_poses(poses)
     entity, gravity = scene.instance_entity, scene.gravity.to(poses)
+    reach = torch.as_tensor(reach, dtype=poses.dtype, device=device).expand(n)
 
     instance, plane = _plane_instances(scene)
     who_plane = entity[instance]
@@ -139,10 +140,10 @@ def find_drops(
     down = gravity[scene.image[who_plane].to(device)]
     slope = -(scene.plane_normal.to(poses)[plane] * down).sum(-1)
     above = torch.where(slope >= SUPPORT_SLOPE, above.clamp_min(0.0) / slope.clamp_min(SUPPORT_SLOPE), torch.inf)
-    above = torch.where(above <= reach, above, torch.inf)
+    above = torch.where(above <= reach[who_plane.to(device)], above, torch.inf)
 
     # only what may stop an object before its plane does is looked at
-    to_plane = _least(above.detach(), who_plane.to(device), n)[0].clamp_max(reach).cpu()
+    to_plane = _least(above.detach(), who_plane.to(device), n)[0].minimum(reach).cpu()
     falls = (scene.gravity != 0).any(-1)
     both_ways = torch.cat([scene.entity_pairs, scene.entity_pairs.flip(1)])
     both_ways = both_ways[both_ways[:, 0] < n]
@@ -161,12 +162,12 @@ def find_drops(
         scene.parts,
         scene.instance_part[pairs],
         down,
-        limit=reach,
+        limit=float(reach.max()) if n else 0.0,
         smoothing=smoothing,
         backend=backend,
     )
     carried = (fall.normal * down).sum(-1) >= SUPPORT_SLOPE
-    height = torch.where(carried, fall.distance, torch.inf)
+    height = torch.where(carried & (fall.distance <= reach[who.to(device)]), fall.distance, torch.inf)
 
     height = torch.cat([height, above])
     who = torch.cat([who, who_plane]).to(device)

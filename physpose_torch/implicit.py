@@ -9,10 +9,11 @@ from torch import Tensor
 from physpose_torch import se3
 from physpose_torch.config import RefinerConfig
 from physpose_torch.prior import make_prior
+from physpose_torch.release import Plan
 from physpose_torch.scene import Scene
 from physpose_torch.solvers.descent import make_cost
 
-__all__ = ["Solution", "attach"]
+__all__ = ["Solution", "attach", "jacobian", "ranks"]
 
 STEP = (2e-5, 2e-4)
 """Half of a central difference [m, rad]."""
@@ -26,14 +27,21 @@ class Solution(NamedTuple):
     """What a refinement minimised, and where it ended; flat."""
 
     poses: Tensor
-    """(N, 4, 4) refined, float64."""
+    """(N, 4, 4) where the solver ended, float64."""
+    kept: Tensor
+    """(N, 4, 4) what was kept of that."""
+    left: Tensor
+    """(N,) bool: estimates that were left as they were."""
+    measured: Tensor
+    """(N, 4, 4) the estimates, float64."""
     scene: Scene
     acts: Tensor
-    """(N,) bool."""
+    """(N,) bool, before the plan."""
     covariance: Tensor | None
     """(N, 6, 6) as given, None: from the config."""
     righted: Tensor
     """(N,) bool."""
+    plan: Plan
     config: RefinerConfig
 
 
@@ -51,15 +59,20 @@ class _Refined(torch.autograd.Function):
     def forward(ctx, measured, solution):
         ctx.save_for_backward(measured)
         ctx.solution = solution
-        return solution.poses.to(measured)
+        return solution.kept.to(measured)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient):
         (measured,) = ctx.saved_tensors
         s = ctx.solution
-        wanted = se3.tangent_gradient(s.poses, gradient.to(s.poses))
-        at_measured = _pulled_back(measured.to(s.poses), s, wanted)
+        wanted = se3.tangent_gradient(s.kept, gradient.to(s.kept))
+        left = s.left[:, None]
+        at_measured = _pulled_back(measured.to(s.poses), s, torch.where(left, 0.0, wanted))
+        # what stays where it is lacks the depth bias, if that is known and the pose itself is not left as it was
+        bias = torch.where((s.kept != measured.to(s.kept)).flatten(1).any(1), s.config.physics.depth_factor, 1.0)
+        own = torch.cat([bias[:, None] * wanted[:, :3], wanted[:, 3:]], dim=1)
+        at_measured = torch.where(left, own, at_measured)
         out = torch.zeros_like(s.poses)
         # the 4×4 gradient G_R = ½ R [v]× has v as its tangent
         out[:, :3, :3] = 0.5 * measured.to(out)[:, :3, :3] @ se3.hat(at_measured[:, 3:])
@@ -69,14 +82,10 @@ class _Refined(torch.autograd.Function):
 
 def _pulled_back(measured: Tensor, s: Solution, wanted: Tensor) -> Tensor:
     """-(∂F/∂m)ᵀ (∂F/∂x)⁻ᵀ wanted, tangent vectors (N, 6) at the refined and at the measured poses."""
-    n, images = len(s.scene), s.scene.n_images
-    counts = torch.bincount(s.scene.image, minlength=images)
-    rank = torch.zeros(n, dtype=torch.long)  # of each object in its image
-    for i in range(images):
-        rank[s.scene.image == i] = torch.arange(int(counts[i]))
-    size = int(counts.max()) if n else 0
-    dF_dx, dF_dm = (_jacobian(measured, s, rank, size, of=of) for of in ("poses", "measured"))
-    prior = make_prior(measured, s.scene, s.acts, s.covariance, s.config.physics)
+    images = s.scene.n_images
+    rank, size = ranks(s.scene)
+    dF_dx, dF_dm = (jacobian(measured, s, rank, size, of=of) for of in ("poses", "measured"))
+    prior = s.plan.prior(make_prior(measured, s.scene, s.acts, s.covariance, s.config.physics), s.config)
     spread = prior.precision.diagonal(dim1=1, dim2=2).rsqrt()  # an estimate's own, the unit of each coordinate
     out = torch.zeros_like(wanted)
     for i in range(images):
@@ -95,7 +104,16 @@ def _pulled_back(measured: Tensor, s: Solution, wanted: Tensor) -> Tensor:
     return out
 
 
-def _jacobian(measured: Tensor, s: Solution, rank: Tensor, size: int, *, of: str) -> Tensor:
+def ranks(scene: Scene) -> tuple[Tensor, int]:
+    """The number (N,) of each object in its image, and how many objects the fullest image has."""
+    counts = torch.bincount(scene.image, minlength=scene.n_images)
+    rank = torch.zeros(len(scene), dtype=torch.long)
+    for i in range(scene.n_images):
+        rank[scene.image == i] = torch.arange(int(counts[i]))
+    return rank, int(counts.max()) if len(scene) else 0
+
+
+def jacobian(measured: Tensor, s: Solution, rank: Tensor, size: int, *, of: str) -> Tensor:
     """(N, 6, size, 6) of F of each object with respect to the poses, or the measured poses, of all objects of its image.
 
     All images at once: a difference moves the same coordinate of one object in each.
@@ -131,10 +149,11 @@ def _prior_poses(measured: Tensor, s: Solution) -> Tensor:
 def _gradient(poses: Tensor, measured: Tensor, s: Solution, copies: int) -> Tensor:
     """F (copies · N, 6): the cost's gradient in the tangent spaces at the poses."""
     scene, acts = Scene.cat([s.scene] * copies), s.acts.repeat(copies)
+    pushes = s.plan.acts.repeat(copies)
     covariance = None if s.covariance is None else s.covariance.repeat(copies, 1, 1)
-    prior = make_prior(measured, scene, acts, covariance, s.config.physics)
+    prior = s.plan.prior(make_prior(measured, scene, acts, covariance, s.config.physics), s.config, copies)
     config = replace(s.config, solver="descent", optimizer="sgd", max_gradient=None, tolerance=0.0)
-    cost = make_cost(prior, scene, acts, config, poses.contiguous(), torch.eye(6).to(poses).expand(len(poses), 6, 6))
+    cost = make_cost(prior, scene, pushes, config, poses.contiguous(), torch.eye(6).to(poses).expand(len(poses), 6, 6))
     with torch.enable_grad():  # backward passes run without
         cost.evaluate(0)
     return cost.gradient.clone()

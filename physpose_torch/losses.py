@@ -220,12 +220,19 @@ class PhysicsLoss(nn.Module):
         return PhysicsTerms(pose, collision.reshape(shape), gravity.reshape(shape), total)
 
 
-def physics_terms(poses: Tensor, scene: Scene, acts: Tensor, config: PhysicsConfig) -> tuple[Tensor, Tensor, Tensor]:
-    """C_i as printed, each object's share of the collisions counted once, and G_i; (N,) each, of flat poses (N, 4, 4)."""
+def physics_terms(
+    poses: Tensor, scene: Scene, acts: Tensor, config: PhysicsConfig, reach: Tensor | float | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """C_i as printed, each object's share of the collisions counted once, and G_i; (N,) each, of flat poses (N, 4, 4).
+
+    An object higher than its ``reach`` [m] above any support feels no gravity; None: the config's, for all.
+    """
+    reach = config.gravity_reach if reach is None else reach
     smoothing, backend = config.smoothing if config.smoothing.kind != "none" else None, config.backend
     margin = config.contact_tolerance if config.gravity == "paper" else 0.0
     contacts = find_contacts(poses, scene, acts=acts, smoothing=smoothing, backend=backend, margin=margin)
-    softness = _contact_softness(contacts.variance, config.collision_weight, config)
+    among = contacts.pair_second < len(scene)
+    softness = _contact_softness(contacts.variance, among, config.collision_weight, config)
     collision, share = collision_loss(contacts, len(scene), softness=softness)
     if config.gravity_weight == 0 or not bool((scene.gravity != 0).any()):
         return collision, share, poses.new_zeros(len(scene))
@@ -240,15 +247,17 @@ def physics_terms(poses: Tensor, scene: Scene, acts: Tensor, config: PhysicsConf
             backend=backend,
         )
     else:
-        drops = find_drops(poses, scene, acts=acts, reach=config.gravity_reach, smoothing=smoothing, backend=backend)
-    softness = _contact_softness(drops.variance, config.gravity_weight, config)
+        drops = find_drops(poses, scene, acts=acts, reach=reach, smoothing=smoothing, backend=backend)
+    among = (drops.support >= 0) & (drops.support < len(scene))
+    softness = _contact_softness(drops.variance, among, config.gravity_weight, config)
     gravity = gravity_loss(drops, softness=softness)
     carried = scene.has_static[scene.image].to(poses.device)  # what rests on nothing known is not pulled together
     return collision, share, torch.where(carried, gravity, torch.zeros_like(gravity))
 
 
-def _contact_softness(variance: Tensor, weight: float, config: PhysicsConfig) -> Tensor:
-    """Softness w of contacts with a surface that is itself uncertain: ζ d²/2w is d²/2σ² for w = ζσ²."""
+def _contact_softness(variance: Tensor, among: Tensor, weight: float, config: PhysicsConfig) -> Tensor:
+    """Softness w of contacts that are uncertain, those ``among`` objects alike: ζ d²/2w is d²/2σ² for w = ζσ²."""
+    variance = torch.where(among, config.sigma_contact**2, variance)
     return (weight * variance).clamp_min(config.softness)
 
 

@@ -28,6 +28,8 @@ class PosePrior(NamedTuple):
     in images without anything static: what their objects have in common is not to be found out there."""
     acts: Tensor
     """(N,) bool; an alternative that pushes nobody has no say in the depth factor either."""
+    reach: Tensor
+    """(N,) an object higher than this above any support [m] feels no gravity."""
     image: Tensor
     """(N,) image of each object."""
     n_images: int
@@ -35,6 +37,12 @@ class PosePrior(NamedTuple):
     """Standard deviation of the depth factor that all estimates of an image share; 0: they are independent."""
     robust: float
     """ν of the robust kernel ρ(m²) = ½ ν log(1 + m²/ν); infinite: ½ m²."""
+
+    def of(self, rows: Tensor, part: Scene) -> "PosePrior":
+        """The prior of the objects ``rows``, which are those of ``part``, see :meth:`Scene.select`."""
+        columns = (x[rows.to(x.device)] for x in (self.measured, self.precision, self.ray, self.acts, self.reach))
+        image = part.image.to(self.image.device)
+        return PosePrior(*columns, image, part.n_images, self.sigma_common, self.robust)
 
 
 def make_prior(
@@ -74,7 +82,8 @@ def make_prior(
     image, acts = scene.image.to(measured.device), acts.to(measured.device)
     # nothing but collisions would drive all objects away from the camera together, where their rays are farther apart
     ray = torch.where(scene.has_static.to(image.device)[image, None], ray, 0.0)
-    return PosePrior(measured, precision, ray, acts, image, scene.n_images, sigma_common, config.robust)
+    reach = measured.new_full((len(measured),), config.gravity_reach)
+    return PosePrior(measured, precision, ray, acts, reach, image, scene.n_images, sigma_common, config.robust)
 
 
 def pose_covariance(measured: Tensor, center: Tensor, config: PhysicsConfig) -> Tensor:

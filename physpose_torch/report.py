@@ -15,7 +15,7 @@ from physpose_torch.losses import acting, check_poses
 from physpose_torch.scene import Scene
 from physpose_torch.stability import BALANCE, Posed, stability_margin
 
-__all__ = ["PhysicsReport", "physics_report", "report_of"]
+__all__ = ["PhysicsReport", "measure", "physics_report", "report_of"]
 
 REACH = 1.0
 """[m]; supports farther below than this are not looked for."""
@@ -172,13 +172,7 @@ def report_of(
         cost: a :class:`~physpose_torch.fused.FusedCost` at these poses, which knows most of it already.
     """
     flat, n, copies = poses.reshape(-1, 4, 4), len(scene), poses.shape[:-3].numel()
-    if hasattr(cost, "measure"):
-        measured = cost.measure(reach=REACH)
-    elif chosen_backend(backend) == "warp" and _fused().remembers(many):
-        measured = _fused().FusedMeasure(many, acts, flat).measure(reach=REACH)
-    else:
-        measured = _measure(flat, many, acts, backend)
-    in_static, in_object, height, support = measured
+    in_static, in_object, height, support = measure(flat, many, acts, backend, cost)
     falls = (many.gravity != 0).any(-1)[many.image].to(flat.device)
     gap = torch.where(falls, height, torch.nan)
     support = torch.where(falls, support, -1)
@@ -197,7 +191,18 @@ def _fused():
     return fused
 
 
-def _measure(poses: Tensor, scene: Scene, acts: Tensor, backend: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def measure(
+    poses: Tensor, scene: Scene, acts: Tensor, backend: str, cost: object | None = None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """How deep flat poses (N, 4, 4) are in statics and in each other, how far they can drop, and onto which entity; (N,) each.
+
+    Args:
+        cost: see :func:`report_of`.
+    """
+    if hasattr(cost, "measure"):
+        return cost.measure(reach=REACH)
+    if chosen_backend(backend) == "warp" and _fused().remembers(scene):
+        return _fused().FusedMeasure(scene, acts, poses).measure(reach=REACH)
     contacts = find_contacts(poses, scene, acts=acts, backend=backend)
     depth = (-contacts.distance).clamp_min(0.0)
     first, second = contacts.pair_first[contacts.pair], contacts.pair_second[contacts.pair]

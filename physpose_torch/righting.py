@@ -135,7 +135,7 @@ def right_fallen(
     first_plane: int,
     limit: float,
     backend: str,
-) -> tuple[Descent, Tensor]:
+) -> tuple[Descent, Tensor, Tensor]:
     """Refine the images in which objects would fall over once more, from estimates that stand.
 
     Where a righted object then runs deeper into something than it did, or hangs higher, its image stays as it was.
@@ -153,7 +153,8 @@ def right_fallen(
         backend: distance backend.
 
     Returns:
-        The result with these images replaced, and which objects (N,) were righted.
+        The result with these images replaced, which objects (N,) were righted, and the estimates (N, 4, 4), theirs as they
+        stand.
     """
     righted = torch.zeros(len(scene), dtype=torch.bool, device=result.poses.device)
     gap, in_static, depth, support = (
@@ -162,14 +163,13 @@ def right_fallen(
     bedded = torch.where(support >= first_plane, in_static, 0.0)
     fallen, turn = find_fallen(result.poses, scene, acts, gap, bedded, limit=limit, backend=backend)
     if not len(fallen):
-        return result, righted
+        return result, righted, prior.measured
     righted[fallen] = True
     images = scene.image[fallen.cpu()].unique()
     part, rows = scene.select(images)
     at = rows.to(righted.device)
     upright = _turned(prior.measured, result.poses, scene, acts, fallen, turn)
-    columns = [x[rows.to(x.device)] for x in prior[1:4]]
-    own = PosePrior(prior.measured[at], *columns, part.image.to(at.device), part.n_images, *prior[6:])
+    own = prior.of(rows, part)
     again = solve(own._replace(measured=upright[at]), part, acts[rows])
     pose = prior_loss(again.poses, own)
     total = again.terms.total + pose_weight * (pose - again.terms.pose)
@@ -180,7 +180,8 @@ def right_fallen(
     good = torch.ones(part.n_images, dtype=torch.bool).index_fill(0, bad, False)
     keep = good[part.image].to(at.device)
     righted[at[~keep]] = False
-    return _merged(result, again, images, good, at, keep), righted
+    standing = torch.where(righted[:, None, None], upright, prior.measured)
+    return _merged(result, again, images, good, at, keep), righted, standing
 
 
 def _turned(measured: Tensor, poses: Tensor, scene: Scene, acts: Tensor, rows: Tensor, turn: Tensor) -> Tensor:

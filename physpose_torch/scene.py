@@ -167,6 +167,30 @@ class Scene:
         scene._packing = self._packing
         return scene, rows
 
+    def replaced(self, rows: Tensor, statics: Sequence[Static]) -> "Scene":
+        """The objects ``rows`` (M,) long only, in all images, with other statics."""
+        objects = [self.objects[i] for i in rows.tolist()]
+        image, same = self.image[rows], self.same_object[rows]
+        return self._of_checked(objects, statics, self.gravity, image, self.n_images, same)
+
+    def detached(self) -> "Scene":
+        """The same with copies of the planes and of the static bodies' poses as they are now, without gradients."""
+        statics = []
+        for s in self.statics:
+            moved, shape = copy(s), s.shape
+            if isinstance(shape, Plane):
+                shape = copy(shape)
+                for name in ("normal", "offset"):
+                    object.__setattr__(shape, name, getattr(shape, name).detach().clone())
+                object.__setattr__(moved, "shape", shape)
+            else:
+                object.__setattr__(moved, "T_camera_body", s.T_camera_body.detach().clone())
+            statics.append(moved)
+        scene = self.replaced(torch.arange(len(self)), statics)
+        scene.gravity = self.gravity.detach().clone()
+        scene._packing = self._packing
+        return scene
+
     @classmethod
     def _of_checked(
         cls,
@@ -324,7 +348,7 @@ class Scene:
     def _checked_gravity(self, gravity: Tensor | None) -> Tensor:
         if gravity is None:
             return torch.zeros(self.n_images, 3, dtype=torch.float64)
-        gravity = torch.as_tensor(gravity, dtype=torch.float64)
+        gravity = torch.as_tensor(gravity, dtype=torch.float64).cpu()
         if gravity.shape == (3,):
             gravity = gravity.expand(self.n_images, 3)
         if gravity.shape != (self.n_images, 3) or not bool(gravity.detach().isfinite().all()):

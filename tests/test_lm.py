@@ -86,7 +86,7 @@ def test_half_a_step_goes_half_the_way():
     assert float(cost.poses[0, 0, 3] - measured[0, 0, 3]) == pytest.approx(0.005, abs=1e-7)
 
 
-@pytest.mark.parametrize("sink", [0.005, 0.02, 0.04])
+@pytest.mark.parametrize("sink", [0.005, 0.02, 0.03])
 def test_sunken_objects_come_out_of_the_table(sink):
     bodies = [BOX, CAN, BOX, CAN]
     result = PhysPoseRefiner(RefinerConfig.lm())(standing(bodies, sink), Scene.tabletop(bodies, TABLE))
@@ -99,11 +99,12 @@ def test_objects_inside_each_other_come_apart():
     measured = standing(bodies, spacing=0.06)
     scene = Scene.tabletop(bodies, TABLE)
     before = physics_report(measured, scene)
-    result = PhysPoseRefiner(RefinerConfig.lm())(measured, scene)
+    strict = dataclasses.replace(RefinerConfig.lm(), physics=PhysicsConfig(sigma_contact=0.0))
+    result = PhysPoseRefiner(strict)(measured, scene)
     assert float(before.penetration_object.max()) > 4e-3
-    # ten half steps of blocks that know nothing of each other do not get all the way
+    # fifteen steps of blocks that know nothing of each other do not get all the way
     assert float(result.report.penetration_object.max()) < 0.4 * float(before.penetration_object.max())
-    longer = PhysPoseRefiner(dataclasses.replace(RefinerConfig.lm(), steps=40))(measured, scene)
+    longer = PhysPoseRefiner(dataclasses.replace(strict, steps=40))(measured, scene)
     assert float(longer.report.penetration_object.max()) < 1e-3
 
 

@@ -24,7 +24,7 @@ from physpose_torch.prior import PosePrior
 from physpose_torch.scene import Scene, Static
 
 EXACT = Smoothing("none")
-HARD = {"softness": 0.0, "smoothing": EXACT}
+HARD = {"softness": 0.0, "sigma_contact": 0.0, "smoothing": EXACT}
 
 
 def rotation(*omega):
@@ -111,7 +111,8 @@ def test_the_robust_cost_grows_like_a_logarithm():
     T[0, 0, 3] = 0.002
     precision = torch.diag(torch.tensor([1e6, 1e4, 1e4, 1.0, 1.0, 100.0], dtype=torch.float64))[None]
     image, ray, acts = torch.zeros(1, dtype=torch.long), torch.ones(1, 3), torch.ones(1, dtype=torch.bool)
-    prior = PosePrior(rotation(0, 0, 0)[None], precision, ray, acts, image, 1, 0.0, math.inf)
+    reach = torch.zeros(1)
+    prior = PosePrior(rotation(0, 0, 0)[None], precision, ray, acts, reach, image, 1, 0.0, math.inf)
     assert prior_loss(T, prior).tolist() == pytest.approx([6.5])
     assert prior_loss(T, prior._replace(robust=4.0)).tolist() == pytest.approx([2 * math.log(4.25)])
 

@@ -26,6 +26,7 @@ from physpose_torch.bench.pairs import batches_table, bench_batches, bench_pairs
 from physpose_torch.bench.part_pairs import make_part_pairs
 from physpose_torch.bench.plot import plot_costs
 from physpose_torch.bench.scenes import bench_scenes, make_config, scenes_table
+from physpose_torch.bench.stress import StressOptions, run_stress
 from physpose_torch.bench.tables import TableOptions, run_tables
 from physpose_torch.bench.training import TrainingOptions, run_training
 from physpose_torch.distance.autograd import backends
@@ -176,6 +177,16 @@ class Training(TrainingOptions, _Bench):
 
 
 @dataclass(frozen=True)
+class Stress(StressOptions, _Bench):
+    """Generated scenes with failures planted: who is made worse, by which preset; and what the covariance is worth."""
+
+    def run(self, results: dict[str, Any], device: torch.device) -> None:
+        if self.plot is not None or self.data is not None or self.backend or device.type != "cpu":
+            raise InvalidInputError("stress: runs on generated scenes on the CPU; no --plot, --data, --backend, --device")
+        run_stress(results, self, self.seed)
+
+
+@dataclass(frozen=True)
 class All(_Bench):
     """Pairs, scenes and growth with modest sizes: what runs without a subcommand."""
 
@@ -199,6 +210,7 @@ COMMANDS = {
     "table": Table,
     "grasp": Grasp,
     "training": Training,
+    "stress": Stress,
 }
 
 

@@ -21,7 +21,7 @@ from physpose_torch.bop.metrics import Scores, evaluate
 from physpose_torch.bop.scenes import ImageScene, poses_of
 from physpose_torch.errors import PhysPoseError
 from physpose_torch.losses import acting
-from physpose_torch.refiner import PhysPoseRefiner
+from physpose_torch.refiner import PhysPoseRefiner, silent_doubts
 from physpose_torch.report import physics_report
 from physpose_torch.scene import Scene
 
@@ -171,7 +171,8 @@ class Ablation:
         for batch in self.batches[: None if self._cold else 1]:
             images = torch.arange(len(batch.images) if self._cold else 1)
             scene, rows = batch.scene(variant.knowledge).select(images)
-            refiner(batch.measured[rows], scene, scores=batch.scores[rows])
+            with silent_doubts():
+                refiner(batch.measured[rows], scene, scores=batch.scores[rows])
         self._cold = False
 
     def _run(self, variant: Variant, on_images: Callable[[int], Any]) -> Outcome:
@@ -185,7 +186,8 @@ class Ablation:
             if refiner is None:
                 new = variant.baseline(batch.measured, scene)
             else:
-                new = refiner(batch.measured, scene, scores=batch.scores).poses
+                with silent_doubts():
+                    new = refiner(batch.measured, scene, scores=batch.scores).poses
             seconds += time.perf_counter() - start
             poses[batch.rows] = new
             known = batch.scene()  # whatever the variant was told

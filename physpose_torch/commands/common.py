@@ -52,14 +52,22 @@ def describe(summary: dict[str, Any]) -> str:
     rows = []
     for key, name in names.items():
         factor = 100.0 if name.endswith("[%]") else 1.0
-        rows.append([name, factor * summary["before"][key], factor * summary["after"][key]])
+        rows.append([name, *(factor * summary[when][key] for when in ("before", "after", "after_moved"))])
     head = (
         f"{summary['refined']} of {summary['images']} images refined, {summary['rows']} poses, "
         f"{1000 * summary['seconds_per_image']:.0f} ms an image"
     )
     if summary["righted"]:
         head += f"\n{summary['righted']} of them could not have stood as estimated, and were turned"
-    lines = [head, "", table(["", "before", "after"], rows)]
+    left = {
+        "rejected": "contradict physics too much to be put right",
+        "unsupported": "have nothing below them",
+        "doubted": "are in images that contradict their planes, listed below",
+    }
+    for why, text in left.items():
+        if summary[why]:
+            head += f"\n{summary[why]} were left as estimated: they {text}"
+    lines = [head, "", table(["", "before", "after", "those moved"], rows)]
     if summary["problems"]:
         lines += ["", f"{summary['images'] - summary['refined']} images kept their poses; see the messages below"]
     return "\n".join(lines)

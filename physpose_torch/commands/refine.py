@@ -15,7 +15,7 @@ from physpose_torch.bop.scenes import ImageScene, poses_of
 from physpose_torch.commands.common import check_output, describe, progress
 from physpose_torch.commands.images import ImageOptions, in_batches, together
 from physpose_torch.config import RefinerConfig
-from physpose_torch.refiner import PhysPoseRefiner
+from physpose_torch.refiner import PhysPoseRefiner, Refinement, silent_doubts
 from physpose_torch.report import PhysicsReport, physics_report
 from physpose_torch.scene import Scene
 
@@ -31,6 +31,9 @@ class Refine(ImageOptions):
     All rows, their order and scores are kept; the time spent is added to the time column. Images that cannot be refined
     (bad rows, no plane, unknown objects) keep their poses, are listed at the end, and the exit code is 1. Images that
     --scenes and --every leave out are copied as they are.
+
+    Poses that physics contradicts too much to be put right are left as they are, as are objects with nothing below them and
+    images whose objects together contradict their plane; --json lists them row by row.
     """
 
     out: Path
@@ -52,18 +55,27 @@ class Refine(ImageOptions):
         refiner = PhysPoseRefiner(self.config)
         poses = estimates.T_camera_object.clone()
         seconds = np.zeros(len(estimates))
-        before, after = _Summary(), _Summary()
+        before, after, moved = _Summary(), _Summary(), _Summary()
         images: list[ImageScene] = []
         righted = 0
+        left: dict[str, list[int]] = {"rejected": [], "unsupported": [], "doubted": []}
+        doubts: list[str] = []
         with progress(total, "refine", "image", quiet=self.quiet) as bar:
             for batch in in_batches(todo, self.batch):
                 for group in together(batch, lambda images: _refine(images, estimates, refiner)):
                     rows = np.concatenate([i.rows for i in group.images])
-                    poses[rows] = group.poses
+                    poses[rows] = group.result.poses
                     seconds[rows] = group.seconds / len(group.images)
+                    result = group.result
                     before.add(group.before)
-                    after.add(group.after)
-                    righted += group.righted
+                    after.add(result.report)
+                    doubted = result.doubted[result.image]
+                    flags = {"rejected": result.rejected, "unsupported": result.unsupported, "doubted": doubted}
+                    for why, flag in flags.items():
+                        left[why] += rows[flag.numpy()].tolist()
+                    moved.add(result.report, ~(result.rejected | result.unsupported | doubted))
+                    righted += int(result.righted.sum())
+                    doubts += [f"{i.name}: {d}" for i, d in zip(group.images, result.doubts, strict=True) if d]
                 for image in batch:
                     image.scene = None  # its memory is needed for the next ones
                 images += batch
@@ -76,15 +88,26 @@ class Refine(ImageOptions):
             "refined": len(refined),
             "rows": int(sum(len(i.rows) for i in refined)),
             "righted": righted,
+            **{why: len(rows) for why, rows in left.items()},
             "seconds_per_image": float(sum(seconds[i.rows[0]] for i in refined) / max(len(refined), 1)),
             "before": before.figures(),
             "after": after.figures(),
+            "after_moved": moved.figures(),
+            "left": [
+                {"line": int(estimates.line[row]), "obj_id": int(estimates.obj_id[row]), "why": why}
+                | {"scene_id": int(estimates.scene_id[row]), "im_id": int(estimates.im_id[row])}
+                for why, rows in left.items()
+                for row in rows
+            ],
+            "doubts": doubts,
             "problems": problems,
         }
         if self.json is not None:
             self.json.write_text(json.dumps(summary, indent=2) + "\n")
         if not self.quiet:
             print(describe(summary))
+        for doubt in doubts:
+            logger.warning("%s", doubt)
         for problem in problems:
             logger.error(problem)
         return 1 if problems else 0
@@ -93,11 +116,9 @@ class Refine(ImageOptions):
 @dataclass
 class _Group:
     images: Sequence[ImageScene]
-    poses: torch.Tensor
+    result: Refinement
     seconds: float
     before: PhysicsReport
-    after: PhysicsReport
-    righted: int
 
 
 def _refine(images: Sequence[ImageScene], estimates: Estimates, refiner: PhysPoseRefiner) -> _Group:
@@ -105,8 +126,9 @@ def _refine(images: Sequence[ImageScene], estimates: Estimates, refiner: PhysPos
     scene = Scene.cat([i.scene for i in images])
     measured, scores = poses_of(images, estimates)
     before = physics_report(measured, scene, scores=scores, backend=refiner.config.physics.backend)
-    result = refiner(measured, scene, scores=scores)
-    return _Group(images, result.poses, time.perf_counter() - start, before, result.report, int(result.righted.sum()))
+    with silent_doubts():  # told by the names of their images
+        result = refiner(measured, scene, scores=scores)
+    return _Group(images, result, time.perf_counter() - start, before)
 
 
 class _Summary:
@@ -116,9 +138,11 @@ class _Summary:
         self.penetration: list[torch.Tensor] = []
         self.gap: list[torch.Tensor] = []
 
-    def add(self, report: PhysicsReport) -> None:
-        self.penetration.append(report.penetration)
-        self.gap.append(report.gap[report.gap.isfinite()])
+    def add(self, report: PhysicsReport, chosen: torch.Tensor | None = None) -> None:
+        """Those of the objects that are ``chosen`` (N,); None: all."""
+        gap = report.gap if chosen is None else report.gap[chosen]
+        self.penetration.append(report.penetration if chosen is None else report.penetration[chosen])
+        self.gap.append(gap[gap.isfinite()])
 
     def figures(self) -> dict[str, float]:
         deep = torch.cat([torch.zeros(0, dtype=torch.float64), *self.penetration]) * 1e3

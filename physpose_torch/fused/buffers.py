@@ -107,7 +107,7 @@ def make_state(
         **dict.fromkeys(
             ("farthest", "pose", "plane_cost", "plane_depth", "plane_height", "collision", "share", "gravity"), (n,)
         ),
-        **dict.fromkeys(("depth_static", "depth_object", "height"), (n,)),
+        **dict.fromkeys(("depth_static", "depth_object", "height", "reach"), (n,)),
         **dict.fromkeys(("pose_slope", "follow_gradient", "follow_follow"), (n,)),
         **dict.fromkeys(("newton", "follow"), (n, 6)),
         "information": (images,),

@@ -28,7 +28,7 @@ def contact(real: type) -> SimpleNamespace:
     make_pair, across = s.make_pair, s.across
     distance, fall, smoothed, Points = p.distance, p.fall, m.smoothed, m.Points
     World, Options, State, vec6, mat66 = w.World, w.Options, w.State, w.vec6, w.mat66
-    join, hinge, hinge_slope = w.join, w.hinge, w.hinge_slope
+    join, hinge, hinge_slope, contact_softness = w.join, w.hinge, w.hinge_slope, w.contact_softness
     lands, apart = boxes(real).lands, boxes(real).apart
     module, zero, one, far = w.module, w.zero, w.one, w.far
     reached = real(REACHED[real])
@@ -44,7 +44,7 @@ def contact(real: type) -> SimpleNamespace:
         if onto < world.n_objects:
             if world.acts[onto] == 0:
                 return zero
-        return wp.min(state.plane_height[who], options.reach)
+        return wp.min(state.plane_height[who], state.reach[who])
 
     @wp.func
     def fall_of(parts: Parts, a: wp.int32, b: wp.int32, R_a: mat33, t_a: vec3, R_b: mat33, t_b: vec3, g: vec3):
@@ -93,6 +93,7 @@ def contact(real: type) -> SimpleNamespace:
         R = back * R_b
         t = back * (t_b - t_a)
         g = world.gravity[image]
+        softness = contact_softness(world, options, options.collision_weight, b)
         part_a = world.instance_part[i]
         cost = zero
         count = int(0)
@@ -142,8 +143,8 @@ def contact(real: type) -> SimpleNamespace:
                     point.b = d.b
                     if options.smooth == 1:
                         point = smoothed(parts, both, d.normal, wobble)
-                    slope = hinge_slope(-gap, options.softness)
-                    cost += hinge(-gap, options.softness)
+                    slope = hinge_slope(-gap, softness)
+                    cost += hinge(-gap, softness)
                     count += 1
                     depth = wp.max(depth, -gap)
                     n = slope * d.normal

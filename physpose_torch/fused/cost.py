@@ -102,7 +102,9 @@ class _Fused:
         """Look at the poses as they are, for supports down to ``reach`` [m]."""
         options = self._k.Options()
         options.collision_weight = options.gravity_weight = options.softness = 1.0
-        options.reach, options.smooth = reach, -1
+        options.smooth = -1
+        own_reach = self._tensor["reach"].clone()
+        self._tensor["reach"].fill_(reach)
         self._tensor["done"].zero_()
         self._commands = self._record(_Fused._launches(self, options))
         self._launch("boxes", "planes")
@@ -111,7 +113,22 @@ class _Fused:
         depth_static, depth_object, height, support = (
             self._tensor[k].clone() for k in ("depth_static", "depth_object", "height", "support")
         )
+        self._tensor["reach"].copy_(own_reach)
         return Measured(depth_static, depth_object, torch.where(height <= reach, height, torch.inf), support.long())
+
+    def overlaps(self) -> tuple[Tensor, Tensor]:
+        """Pairs of entities (E, 2), and how deep the parts of each are in one another at most (E,) [m]."""
+        options = self._k.Options()
+        options.collision_weight = options.softness = 1.0
+        options.smooth = -1
+        self._tensor["done"].zero_()
+        self._commands = self._record(_Fused._launches(self, options))
+        self._launch("boxes")
+        self._launch_rows()
+        pairs = torch.stack([self._world._tensors[name].long() for name in ("pair_first", "pair_second")], dim=1)
+        depth = self._tensor["row_depth"]
+        row_pair = self._world._tensors["row_pair"].long()
+        return pairs, depth.new_zeros(len(pairs)).scatter_reduce(0, row_pair, depth, "amax")
 
     def _launch(self, *names: str) -> None:
         for name in names:
@@ -165,15 +182,18 @@ class FusedCost(_Fused):
         options = self._k.Options()
         for name in ("pose_weight", "collision_weight", "gravity_weight", "softness"):
             setattr(options, name, getattr(physics, name))
+        options.contact_variance = physics.sigma_contact**2
         options.softness = max(options.softness, 1e-30)  # the paper's hinge, without a division by zero
-        options.reach, options.tolerance, options.max_step = physics.gravity_reach, config.tolerance, config.max_step
+        options.tolerance, options.max_step = config.tolerance, config.max_step
         if physics.gravity == "paper":
             options.paper, options.margin = 1, physics.contact_tolerance
-            options.reach = FAR / 2  # it pulls from any height, but not towards nothing
         options.max_gradient = FAR if config.max_gradient is None else config.max_gradient
         options.smooth, options.newton, options.damping = int(smoothing is not None), int(lm), config.damping
         options.still_steps = LM_STILL_STEPS if lm else STILL_STEPS
         self._state, self._tensor = make_state(self._k, self._world, scene, poses, lm=lm)
+        # the paper's gravity pulls from any height, but not towards nothing
+        reach = torch.full_like(prior.reach, FAR / 2) if physics.gravity == "paper" else prior.reach
+        self._tensor["reach"].copy_(reach)
         self.step = torch.zeros(self.n, 6, dtype=self.dtype, device=self.device)
         self._commands = self._record(self._launches(options))
 

@@ -22,7 +22,7 @@ def objects(real: type) -> SimpleNamespace:
     vec3, Parts, Wobble, smoothed = s.vec3, s.Parts, m.Wobble, m.smoothed
     rotation, translation, orthonormal, make_pair = s.rotation, s.translation, s.orthonormal, s.make_pair
     World, Prior, Options, State, vec6, mat66 = w.World, w.Prior, w.Options, w.State, w.vec6, w.mat66
-    join, hinge, hinge_slope = w.join, w.hinge, w.hinge_slope
+    join, hinge, hinge_slope, contact_softness = w.join, w.hinge, w.hinge_slope, w.contact_softness
     plane_softness, lowest_point, fall_of = flat.plane_softness, flat.lowest_point, contact(real).fall_of
     cholesky, solve = step(real).cholesky, step(real).solve
     module, zero, one, half, two = w.module, w.zero, w.one, w.half, w.two
@@ -118,7 +118,7 @@ def objects(real: type) -> SimpleNamespace:
                             weight = two * weight
                         curvature += weight * block
         gravity = zero
-        if height > zero and height <= options.reach and options.gravity_weight > zero and world.grounded[image] == 1:
+        if height > zero and height <= state.reach[i] and options.gravity_weight > zero and world.grounded[image] == 1:
             softness = options.softness
             if other < 0:
                 plane = state.plane_best[i]
@@ -141,6 +141,7 @@ def objects(real: type) -> SimpleNamespace:
                     j = join(world.plane_normal[plane], wp.cross(point, up))
                     curvature += (slope / (height * rate)) * wp.outer(j, j)
             else:
+                softness = contact_softness(world, options, options.gravity_weight, other)
                 part_a = world.instance_part[own_instance]
                 part_b = world.instance_part[other_instance]
                 R_b = orthonormal(rotation(state.poses[other]))
@@ -205,7 +206,7 @@ def objects(real: type) -> SimpleNamespace:
         among = zero
         height = state.plane_height[i]
         support = int(-1)
-        if height <= options.reach:
+        if height <= state.reach[i]:
             support = world.image.shape[0] + state.plane_best[i]
         for k in range(world.object_pair_start[i], world.object_pair_start[i + 1]):
             pair = world.object_pair[k]

@@ -107,7 +107,7 @@ def planes(real: type) -> SimpleNamespace:
                     best_plane = plane
             elif slope >= support_slope:
                 above = wp.max(lowest, zero) / slope
-                if above <= options.reach and above < best:
+                if above <= state.reach[i] and above < best:
                     best = above
                     best_plane = plane
                     best_instance = lowest_instance

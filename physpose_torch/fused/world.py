@@ -79,8 +79,9 @@ def world(real: type) -> SimpleNamespace:
         """Whether gravity is the paper's: the mean height of an object's parts above a plane, and none in contact."""
         margin: real
         """Parts nearer than this count as in contact then; else 0."""
-        reach: real
         softness: real
+        contact_variance: real
+        """Of the gap between two objects in contact."""
         max_gradient: real
         max_step: real
         tolerance: real
@@ -96,6 +97,8 @@ def world(real: type) -> SimpleNamespace:
         """What changes from step to step."""
 
         poses: wp.array(dtype=mat44)
+        reach: wp.array(dtype=real)
+        """How far down what carries each object is looked for."""
         lower: wp.array(dtype=vec3)
         upper: wp.array(dtype=vec3)
         entity_lower: wp.array(dtype=vec3)
@@ -177,5 +180,12 @@ def world(real: type) -> SimpleNamespace:
         if x < softness:
             return x / softness
         return one
+
+    @wp.func
+    def contact_softness(world: World, options: Options, weight: real, other: wp.int32):
+        """ζσ² of an object's contact with another entity, at least the usual softness: ζ d²/2w is d²/2σ² then."""
+        if other < world.n_objects:
+            return wp.max(options.softness, weight * options.contact_variance)
+        return options.softness
 
     return SimpleNamespace(**locals())

@@ -40,7 +40,7 @@ class GeneralCost:
         w = self._config.physics
         with torch.no_grad():
             pose = prior_loss(self.poses, self._prior)
-            collision, share, gravity = physics_terms(self.poses, self._scene, self._acts, w)
+            collision, share, gravity = physics_terms(self.poses, self._scene, self._acts, w, self._prior.reach)
         total = w.pose_weight * pose + w.collision_weight * share + w.gravity_weight * gravity
         return PhysicsTerms(pose, collision, gravity, total)
 
@@ -59,7 +59,7 @@ class GeneralCost:
         w, rows = self._config.physics, self._rows
         leaf = self.poses[rows].requires_grad_()
         pose = prior_loss(leaf, self._active_prior)
-        collision, share, gravity = physics_terms(leaf, self._active, self._acts[rows], w)
+        collision, share, gravity = physics_terms(leaf, self._active, self._acts[rows], w, self._active_prior.reach)
         total = w.pose_weight * pose + w.collision_weight * share + w.gravity_weight * gravity
         (gradient,) = torch.autograd.grad(total.sum(), leaf)
         self._terms = PhysicsTerms(*(x.detach() for x in (pose, collision, gravity, total)))
@@ -85,6 +85,4 @@ class GeneralCost:
     def _select(self) -> None:
         """Scene, rows and prior of the images that are still running."""
         self._active, self._rows = self._scene.select((~self.done).nonzero()[:, 0])
-        prior, image = self._prior, self._active.image.to(self._prior.image.device)
-        selected = (x[self._rows.to(x.device)] for x in prior[:4])
-        self._active_prior = PosePrior(*selected, image, self._active.n_images, *prior[6:])
+        self._active_prior = self._prior.of(self._rows, self._active)
