@@ -63,6 +63,8 @@ class Heights(NamedTuple):
     """How high the camera is above the object's centre [m]: a depth factor 1 + s lowers the object by s times this."""
     variance: Tensor
     """Of the plane's surface there [m²]."""
+    tilt_variance: Tensor
+    """And of the plane's tilt [rad²]."""
     rest: NearestRest
     """The nearest stable pose."""
     up: Tensor
@@ -101,10 +103,12 @@ def look(prior: PosePrior, scene: Scene, acts: Tensor, backend: str) -> Heights:
     level = torch.where(on_plane & lowest.isfinite(), lowest, torch.nan)
     variance = torch.where(flat, plane_variance(poses, scene, who, plane, acts), 0.0)
     variance = poses.new_zeros(n).scatter_reduce(0, who, variance, "amax")
+    tilt = scene.plane_covariance.to(poses).diagonal(dim1=1, dim2=2)[:, :2].mean(1)
+    tilt = poses.new_zeros(n).scatter_reduce(0, who, torch.where(flat, tilt[plane], 0.0), "amax")
 
     camera = (scene.centers(poses) * gravity).sum(-1)
     local = -(poses[:, :3, :3].mT @ gravity[:, :, None])[:, :, 0]
-    return Heights(height, level, camera, variance, nearest_rest(scene.objects, local), -gravity)
+    return Heights(height, level, camera, variance, tilt, nearest_rest(scene.objects, local), -gravity)
 
 
 def asked_depth(heights: Heights, prior: PosePrior, scores: Tensor) -> Tensor:
@@ -208,14 +212,17 @@ class Flush(NamedTuple):
     """(N, 3) against gravity, camera frame."""
     own_up: Tensor
     """(N, 3) what points there in the nearest stable pose, object frame."""
+    variance: Tensor
+    """(N,) of the plane's tilt [rad²]."""
 
     @classmethod
     def of(cls, heights: Heights) -> "Flush":
         stands = (heights.rest.tilt < FLUSH) & (heights.level < NEAR) & (heights.level > -SUNK)
-        return cls(stands, heights.up, heights.rest.up)
+        return cls(stands, heights.up, heights.rest.up, heights.tilt_variance)
 
     def join(self, prior: PosePrior, sigma: float) -> PosePrior:
-        """The prior joined with this: the tilt against the stable pose, about two axes, is zero to within ``sigma`` [rad].
+        """The prior joined with this: the tilt against the stable pose, about two axes, is zero to within ``sigma`` [rad], and
+        what the plane's own tilt may be off.
 
         True poses and planes of real data are 2° apart. Turning about the vertical is left free.
         """
@@ -225,7 +232,8 @@ class Flush(NamedTuple):
         axis = torch.linalg.cross(self.own_up, up)
         sine = axis.norm(dim=1, keepdim=True).clamp(1e-12, 1.0)
         turn = torch.arcsin(sine) / sine * axis
-        level = (torch.eye(3).to(up) - up[:, :, None] * up[:, None, :]) / sigma**2
+        level = torch.eye(3).to(up) - up[:, :, None] * up[:, None, :]
+        level = level / (sigma**2 + self.variance)[:, None, None]
         precision = prior.precision.clone()
         precision[:, 3:, 3:] += level
         pull = torch.cat([torch.zeros_like(turn), (level @ turn[:, :, None])[:, :, 0]], dim=1)

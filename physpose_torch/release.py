@@ -27,11 +27,15 @@ from physpose_torch.stability import BALANCE, Posed, stability_margin
 __all__ = ["Plan", "Released", "make_plan", "release"]
 
 DEEP = 5e-3
-"""[m]; an object this deep in something, or this high above it, has not come to rest."""
+"""[m]; an object this deep in something, or this high above it, has not come to rest; nor is it if that is more than …"""
+SOFT = 3.0
+"""… this many σ of its plane."""
 DUBIOUS = 0.01
 """[m]; one that pushes nobody, and is this deep in another one at the end, has not found its place."""
 LEAST_REACH = 0.015
 """[m]; so far down supports are always looked for."""
+DEPTH = 0.01
+"""Least standard deviation of the depth factor of an image: however well an estimator is known, scenes differ by so much."""
 TILT = math.radians(2.75)
 """Standard deviation of the tilt that the objects of an image agree on, where estimates and plane are right."""
 LOWEST = 0.05
@@ -55,6 +59,8 @@ class Plan(NamedTuple):
     """(N,) how far down supports are looked for while all are still off by the common depth factor [m]."""
     own_reach: Tensor
     """(N,) and how far without it."""
+    plane_sigma: Tensor
+    """(N,) of the height of the plane that each object is on or in [m]."""
     doubts: tuple[str, ...]
     """(I) why each image is left as it is, or nothing."""
 
@@ -94,7 +100,7 @@ def make_plan(
     flush = physics.sigma_flush < math.inf
     careful = min(caution.conflict, caution.release, caution.doubt) < math.inf or caution.least_sigma < 1
     if not len(scene) or not (flush or careful):
-        return Plan(acts, nobody, ones, None, prior.reach, prior.reach, none)
+        return Plan(acts, nobody, ones, None, prior.reach, prior.reach, 0 * prior.reach, none)
     heights = look(prior, scene, acts, physics.backend)
     weighed = torch.ones(len(scene)) if scores is None else torch.as_tensor(scores).detach()
     weighed = weighed.to(prior.ray)
@@ -115,7 +121,7 @@ def make_plan(
     if caution.doubt < math.inf:
         doubts = _doubts(heights, depth, prior, scene, caution.doubt)
     stands = Flush.of(heights) if flush else None
-    return Plan(acts & ~dubious, dubious, scale, stands, reach, own_reach, doubts)
+    return Plan(acts & ~dubious, dubious, scale, stands, reach, own_reach, heights.variance.sqrt(), doubts)
 
 
 def _doubts(heights: Heights, depth: Tensor, prior: PosePrior, scene: Scene, limit: float) -> tuple[str, ...]:
@@ -127,7 +133,8 @@ def _doubts(heights: Heights, depth: Tensor, prior: PosePrior, scene: Scene, lim
     count = zeros.index_add(0, prior.image, prior.acts.to(zeros))
     acting = torch.where(prior.acts, 1 / count[prior.image].clamp_min(1), 0.0)
     camera, variance = (zeros.index_add(0, prior.image, acting * x) for x in (heights.camera, heights.variance))
-    depth_sigma = (prior.sigma_common**2 + variance / camera.clamp_min(LOWEST) ** 2).sqrt()
+    common = max(prior.sigma_common, DEPTH) if prior.sigma_common > 0 else 0.0
+    depth_sigma = (common**2 + variance / camera.clamp_min(LOWEST) ** 2).sqrt()
     tilt_variance = scene.plane_covariance.to(zeros).diagonal(dim1=1, dim2=2)[:, :2].amax(1)
     tilt_variance = zeros.scatter_reduce(0, scene.plane_image.to(zeros.device), tilt_variance, "amax")
     tilt_sigma = (TILT**2 + tilt_variance).sqrt()
@@ -135,7 +142,7 @@ def _doubts(heights: Heights, depth: Tensor, prior: PosePrior, scene: Scene, lim
     columns = (count, depth, depth_sigma, asked_tilt(heights, prior), tilt_sigma)
     for n, s, s_sigma, tilt, t_sigma in zip(*(x.tolist() for x in columns), strict=True):
         reasons = []
-        if n > 1 and abs(s) > limit * s_sigma > 0:
+        if n > 1 and common > 0 and abs(s) > limit * s_sigma:
             reasons.append(
                 f"its objects would have to be at {1 + s:.3f} of their distances to stand on the plane, expected 1 ± "
                 f"{limit * s_sigma:.3f}; check plane, units and intrinsics, or calibrate the estimator"
@@ -184,7 +191,10 @@ def release(
     """
     caution = config.caution
     nobody = torch.zeros_like(righted)
-    gap, in_object, depth = (x.reshape(-1) for x in (report.gap, report.penetration_object, report.penetration))
+    gap, in_object, depth, in_static, support = (
+        x.reshape(-1)
+        for x in (report.gap, report.penetration_object, report.penetration, report.penetration_static, report.support)
+    )
     grounded = (scene.has_static & (scene.gravity != 0).any(-1)).to(righted.device)[prior.image]
     grounded = grounded & (config.physics.gravity_weight > 0)
     moved = _excess(poses, standing, prior, scene, turned=righted)
@@ -193,10 +203,13 @@ def release(
     if bool(far.any()):
         part, here = scene.select(scene.image[far.cpu()].unique())  # most images have nothing to look at
         at = here.to(far.device)
-        posed = Posed.of(poses[at], part, plan.acts[here], gap[at], config.physics.backend)
+        # a plane that is not well known is soft; who lies in it is judged where it would just touch
+        bedded = torch.where(support >= len(scene) + len(scene.static_bodies), in_static, 0.0)
+        posed = Posed.of(poses[at], part, plan.acts[here], (gap - bedded)[at], config.physics.backend)
         margin = torch.full_like(gap, torch.nan).index_copy(0, at, stability_margin(posed, only=far[at]).to(gap))
-        stands = ~grounded | ((gap < DEEP) & (margin > BALANCE))
-        rejected = far & (righted | (depth > DEEP) | ~stands)
+        deep = (SOFT * plan.plane_sigma).clamp_min(DEEP)
+        stands = ~grounded | ((gap < deep) & (margin > BALANCE))
+        rejected = far & (righted | (depth > deep) | ~stands)
     if caution.release < math.inf:
         rejected = rejected | (plan.dubious.to(righted.device) & (in_object > DUBIOUS))
     unsupported = nobody
