@@ -24,7 +24,7 @@ from physpose_torch.demo import household_bodies
 from physpose_torch.errors import InvalidInputError
 from physpose_torch.geometry.body import Body, Plane
 from physpose_torch.household import HouseholdScene, household_meshes, household_scene, perturb_like_estimator
-from physpose_torch.refiner import PhysPoseRefiner
+from physpose_torch.refiner import PhysPoseRefiner, silent_doubts
 from physpose_torch.robot.grasp import OUTCOMES, Handle, grasp_pose, judge_grasps
 from physpose_torch.scene import Scene
 
@@ -160,11 +160,16 @@ def _scene_rows(
 def _methods(bias: float) -> dict[str, Callable[[Tensor, Scene], Tensor]]:
     """What is compared; the one factor is the true one, which only a label could tell."""
     refiner = PhysPoseRefiner(RefinerConfig())
+
+    def refined(poses: Tensor, scene: Scene) -> Tensor:
+        with silent_doubts():
+            return refiner(poses, scene).poses
+
     return {
         "initial": as_estimated,
         "one depth factor (by label)": partial(scale_depth, factor=1 / (1 + bias)),
         "slid onto the table": slide_onto_planes,
-        "refined": lambda poses, scene: refiner(poses, scene).poses,
+        "refined": refined,
     }
 
 

@@ -22,7 +22,7 @@ from physpose_torch.commands.common import progress, table
 from physpose_torch.config import PhysicsConfig
 from physpose_torch.errors import InvalidInputError
 from physpose_torch.geometry.body import Body
-from physpose_torch.refiner import PhysPoseRefiner
+from physpose_torch.refiner import PhysPoseRefiner, silent_doubts
 from physpose_torch.report import physics_report
 
 __all__ = ["MEASURES", "TrainingOptions", "evaluate", "run_training", "training_table"]
@@ -126,7 +126,8 @@ def run_training(results: dict[str, Any], options: TrainingOptions, seed: int) -
                 poses = predict(trainer(data, points, seed=s, **arguments), test)
                 rows.append({"seed": s, "name": name, **evaluate(poses, test, bodies)})
                 if name == "labels":
-                    refined = PhysPoseRefiner()(poses, scene).poses
+                    with silent_doubts():
+                        refined = PhysPoseRefiner()(poses, scene).poses
                     rows.append({"seed": s, "name": "labels, then refined", **evaluate(refined, test, bodies)})
                 bar.update()
     results["training"] = rows
