@@ -79,16 +79,17 @@ class Refine(ImageOptions):
             with journal:
                 try:
                     self._refine(index, known, journal, totals)
-                    temporary = out.with_name(f".{out.name}.tmp")
-                    with written(out), replacing(out, temporary=temporary) as file:
+                    temporary = f".{out.name}.tmp"  # the one that a killed run left, if any
+                    with written(out), replacing(out, temporary=out.with_name(temporary)) as file:
                         file.writelines(journal.merged(index))
                     if self.json is not None:
-                        with written(self.json), replacing(self.json) as file:
+                        temporary = self.json.with_name(f".{out.name}.json.tmp")
+                        with written(self.json), replacing(self.json, temporary=temporary) as file:
                             file.write(json.dumps(totals.summary(), indent=2).encode() + b"\n")
                 except KeyboardInterrupt:
                     if not journal.committed:
                         raise
-                    done = f"{totals.counts['images']} of {len(index.choose(self.scenes, self.every))} images are done"
+                    done = f"{totals.counts['images']} of {self._count(index)} images are done"
                     raise KeyboardInterrupt(f"{done}; the same command with --resume goes on") from None
                 journal.remove()
         if not self.quiet:
@@ -111,7 +112,7 @@ class Refine(ImageOptions):
         refiner = PhysPoseRefiner(self.config)
         chosen = index.choose(self.scenes, self.every)
         done = totals.counts["images"]
-        with progress(len(chosen), "refine", "image", quiet=self.quiet, initial=done) as bar:
+        with progress(self._count(index), "refine", "image", quiet=self.quiet, initial=done) as bar:
             for start in range(done, len(chosen), size := max(AT_A_TIME, self.batch)):
                 keys = [(s, i) for s, i in index.keys[chosen[start : start + size]].tolist()]
                 estimates = index.read(index.numbers([*keys, *known.partners(keys)]))
@@ -126,6 +127,10 @@ class Refine(ImageOptions):
         if index.unplaced:
             totals.counts["images"] += 1
             totals.problems += index.unplaced
+
+    def _count(self, index: EstimatesIndex) -> int:
+        """How many images there are to look at or to complain about; rows of no image count as one."""
+        return len(index.choose(self.scenes, self.every)) + bool(index.unplaced)
 
     def _about(self, index: EstimatesIndex, known: Known) -> dict[str, Any]:
         """Whatever decides the result, by what it is called in messages."""
