@@ -98,8 +98,10 @@ def child(root, *more):
 
 def records(root):
     """How many batches the journal has."""
-    journal = root / "out.csv.journal"
-    return journal.read_bytes().count(b'{"rows"') if journal.exists() else 0
+    try:
+        return (root / "out.csv.journal").read_bytes().count(b'{"rows"')
+    except FileNotFoundError:
+        return 0
 
 
 def kill_and_resume(root, kills, rng):
@@ -175,9 +177,8 @@ def test_a_hundred_kills_change_nothing(dataset, undisturbed, few_at_a_time):
 def test_a_real_process_that_is_stopped_keeps_what_is_done(dataset, undisturbed, sign):
     """Ctrl-C: a message, exit code 130. Either way nothing is written at --out, and --resume goes on."""
     command = [sys.executable, "-m", "physpose_torch", *arguments(dataset, "--config.steps", "200")]
-    journal = dataset / "out.csv.journal"
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        while process.poll() is None and not (journal.exists() and journal.read_bytes().count(b'{"rows"') > 1):
+        while process.poll() is None and records(dataset) < 2:
             time.sleep(0.01)
         process.send_signal(sign)
         message = process.stderr.read()
@@ -351,13 +352,18 @@ def test_when_the_disk_is_full_nothing_is_half_written_and_resume_goes_on(datase
         assert result(dataset) == undisturbed
 
 
+def write_large(root, rows):
+    """A result file of scene 3, shuffled, ten rows an image."""
+    row = csv_row(3, 0, 1, 0.9, standing(0, 0, 50)).split(",", 2)[2]
+    with (root / "est.csv").open("w") as file:
+        file.writelines(f"3,{k * 7919 % (rows // 10)},{row}\n" for k in range(rows))
+
+
 def test_memory_does_not_grow_with_a_file_of_which_nothing_is_refined(dataset):
     """A row is 240 bytes of text, and was 1.6 kB in memory."""
 
     def peak(rows):
-        row = csv_row(3, 0, 1, 0.9, standing(0, 0, 50)).split(",", 2)[2]
-        with (dataset / "est.csv").open("w") as file:
-            file.writelines(f"3,{k * 7919 % (rows // 10)},{row}\n" for k in range(rows))
+        write_large(dataset, rows)
         tracemalloc.start()
         try:
             assert refine(dataset, "--scenes", "5") == 0
@@ -368,3 +374,26 @@ def test_memory_does_not_grow_with_a_file_of_which_nothing_is_refined(dataset):
     few, many = peak(5_000), peak(50_000)
     assert (dataset / "out.csv").read_bytes() == (dataset / "est.csv").read_bytes()
     assert many - few < 45_000 * 100
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="Linux only")
+@pytest.mark.parametrize("more", [("--scenes", "5"), ()], ids=["nothing chosen", "no plane anywhere"])
+def test_a_process_needs_little_more_memory_for_a_million_rows_than_for_ten_thousand(dataset, more):
+    """Prints the peak of each (pytest -s): where no image is chosen, and where all are read and found to have no plane."""
+    (dataset / "planes.json").write_text("{}")
+    code = (
+        "import sys; from pathlib import Path; from physpose_torch.__main__ import main; code = main(sys.argv[1:])\n"
+        "print(code, Path('/proc/self/status').read_text().split('VmHWM:')[1].split()[0])"
+    )
+    peaks = {}
+    for rows in (10_000, 100_000, 1_000_000):
+        write_large(dataset, rows)
+        start = time.monotonic()
+        command = [sys.executable, "-c", code, *arguments(dataset, *more)]
+        printed = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, check=True).stdout.split()
+        assert int(printed[0]) == (0 if more else 1)
+        peaks[rows] = int(printed[1]) / 1024
+        print(f"\n{rows} rows: {peaks[rows]:.0f} MB, {time.monotonic() - start:.0f} s")
+    assert (dataset / "out.csv").read_bytes() == (dataset / "est.csv").read_bytes()
+    assert peaks[1_000_000] - peaks[10_000] < 150
