@@ -35,25 +35,27 @@ class Journal:
 
     Args:
         path: the file.
-        about: whatever decides the result, JSON; a journal that is about something else is not resumed.
-        lines: how many lines the result file has; memory is 8 bytes each.
         resume: go on with an existing journal; if there is none, begin.
 
     Raises:
-        DataError: it cannot be written, is in use, is about something else, or is there though ``resume`` is not asked for.
+        DataError: it cannot be written, is in use, is no journal, or is there though ``resume`` is not asked for.
     """
 
     path: Path
     committed: int
     """How many records there are."""
 
-    def __init__(self, path: Path, about: Mapping[str, Any], *, lines: int, resume: bool = False) -> None:
-        self.path, self.committed, self._new = path, 0, False
-        self._at = np.full(lines + 1, -1, dtype=np.int64)  # byte offset of each line's text
+    def __init__(self, path: Path, *, resume: bool = False) -> None:
+        self.path, self.committed = path, 0
         with written(path):
             self._file = _locked(path)
         try:
-            self._begin(json.loads(json.dumps(about)), resume)
+            self._head = self._read_head()
+            self._new = not self._head
+            if self._head and not resume:
+                raise DataError(
+                    f"{path}: an earlier run stopped before its end; go on with --resume, or delete this file to begin anew"
+                )
         except BaseException:
             self._file.close()
             raise
@@ -66,34 +68,32 @@ class Journal:
             self.remove()
         self._file.close()
 
-    def replay(self) -> Iterator[dict[str, Any]]:
-        """The records of earlier runs, in order; to be read to the end before new ones are committed."""
-        at = end = self._end
-        places: dict[int, int] = {}
-        crc = 0
-        with open(self.path, "rb") as file:
-            file.seek(at)
-            for line in file:
-                if not line.endswith(b"\n"):
-                    break
-                if line.startswith(b"{"):
-                    record = _record(line, len(places), crc)
-                    if record is None:
-                        break
-                    self._at[list(places)] = list(places.values())
-                    self.committed += 1
-                    end, places, crc = at + len(line), {}, 0
-                    yield record
-                else:
-                    number, _, _ = line.partition(b" ")
-                    if not number.isdigit() or not 0 < int(number) < len(self._at):
-                        break
-                    places[int(number)] = at + len(number) + 1
-                    crc = zlib.crc32(line, crc)
-                at += len(line)
-        self._end = end
-        with written(self.path):
-            self._file.truncate(end)
+    def begin(self, about: Mapping[str, Any], *, lines: int) -> Iterator[dict[str, Any]]:
+        """The records of earlier runs, in order; to be read to the end before new ones are committed.
+
+        Args:
+            about: whatever decides the result, JSON; a journal that is about something else is not resumed.
+            lines: how many lines the result file has; memory is 8 bytes each.
+
+        Raises:
+            DataError: it is about something else, or cannot be written.
+        """
+        head = json.dumps({"kind": _KIND, **about})
+        self._at = np.full(lines + 1, -1, dtype=np.int64)  # byte offset of each line's text
+        if self._new:
+            self._end = 0
+            self._append(head.encode() + b"\n")
+            self._end = len(head) + 1
+            _sync_folder(self.path.parent)
+            return iter(())
+        before, now = json.loads(self._head), json.loads(head)
+        if before != now:
+            raise DataError(
+                f"{self.path}: --resume goes on with the same files and options only, but this run differs in "
+                f"{_differences(before, now)}; restore them, or delete this file to begin anew"
+            )
+        self._end = len(self._head)
+        return self._replay()
 
     def commit(self, rows: Sequence[tuple[int, str]], record: Mapping[str, Any]) -> None:
         """Keep the new (line number, text) of rows and a record of them; they are on disk when this returns.
@@ -127,38 +127,53 @@ class Journal:
 
     def remove(self) -> None:
         """Delete the file: the run is over."""
+        self._new = False  # what is there after this is another run's
         if fcntl is None:
             self._file.close()
         with contextlib.suppress(FileNotFoundError):
             self.path.unlink()
 
-    def _begin(self, about: dict[str, Any], resume: bool) -> None:
+    def _read_head(self) -> bytes:
+        """The first line; nothing if the journal is new, or its run was killed before it began."""
         with open(self.path, "rb") as file:
             head = file.readline()
-        if not head.endswith(b"\n"):  # new, or killed before it began
-            if not _HEAD.startswith(head[: len(_HEAD)]):
-                raise self._foreign()
-            self._end, self._new = 0, True
-            self._append(json.dumps({"kind": _KIND, **about}).encode() + b"\n")
-            self._end = os.fstat(self._file.fileno()).st_size
-            _sync_folder(self.path.parent)
-            return
+        if not head.endswith(b"\n") and _HEAD.startswith(head[: len(_HEAD)]):
+            return b""
         try:
-            before = json.loads(head)
+            about = json.loads(head)
         except ValueError:
-            raise self._foreign() from None
-        if not isinstance(before, dict) or before.pop("kind", None) != _KIND:
-            raise self._foreign()
-        if not resume:
-            raise DataError(
-                f"{self.path}: an earlier run stopped before its end; go on with --resume, or delete this file to begin anew"
-            )
-        if before != about:
-            raise DataError(
-                f"{self.path}: --resume goes on with the same files and options only, but this run differs in "
-                f"{_differences(before, about)}; restore them, or delete this file to begin anew"
-            )
-        self._end = len(head)
+            about = None
+        if not isinstance(about, dict) or about.get("kind") != _KIND:
+            raise DataError(f"{self.path}: is no journal of physpose refine; move it away, or choose another --out")
+        return head
+
+    def _replay(self) -> Iterator[dict[str, Any]]:
+        at = end = self._end
+        places: dict[int, int] = {}
+        crc = 0
+        with open(self.path, "rb") as file:
+            file.seek(at)
+            for line in file:
+                if not line.endswith(b"\n"):
+                    break
+                if line.startswith(b"{"):
+                    record = _record(line, len(places), crc)
+                    if record is None:
+                        break
+                    self._at[list(places)] = list(places.values())
+                    self.committed += 1
+                    end, places, crc = at + len(line), {}, 0
+                    yield record
+                else:
+                    number, _, _ = line.partition(b" ")
+                    if not number.isdigit() or not 0 < int(number) < len(self._at):
+                        break
+                    places[int(number)] = at + len(number) + 1
+                    crc = zlib.crc32(line, crc)
+                at += len(line)
+        self._end = end
+        with written(self.path):
+            self._file.truncate(end)
 
     def _append(self, data: bytes) -> None:
         with written(self.path):
@@ -173,9 +188,6 @@ class Journal:
                 with contextlib.suppress(OSError):
                     self._file.truncate(self._end)
                 raise
-
-    def _foreign(self) -> DataError:
-        return DataError(f"{self.path}: is no journal of physpose refine; move it away, or choose another --out")
 
 
 @contextlib.contextmanager

@@ -71,27 +71,22 @@ class Refine(ImageOptions):
         out = self.out.resolve()  # of a link, the file it points to
         if out.exists() and not out.is_file():
             raise DataError(f"{self.out}: is no regular file; name a file to write")
-        with self._index() as index:
-            known, totals = self.known(), Totals()
-            journal = Journal(
-                out.with_name(f"{out.name}.journal"), self._about(index, known), lines=index.lines, resume=self.resume
-            )
-            with journal:
-                try:
-                    self._refine(index, known, journal, totals)
-                    temporary = f".{out.name}.tmp"  # the one that a killed run left, if any
-                    with written(out), replacing(out, temporary=out.with_name(temporary)) as file:
-                        file.writelines(journal.merged(index))
-                    if self.json is not None:
-                        temporary = self.json.with_name(f".{out.name}.json.tmp")
-                        with written(self.json), replacing(self.json, temporary=temporary) as file:
-                            file.write(json.dumps(totals.summary(), indent=2).encode() + b"\n")
-                except KeyboardInterrupt:
-                    if not journal.committed:
-                        raise
-                    done = f"{totals.counts['images']} of {self._count(index)} images are done"
-                    raise KeyboardInterrupt(f"{done}; the same command with --resume goes on") from None
-                journal.remove()
+        totals = Totals()
+        with Journal(out.with_name(f"{out.name}.journal"), resume=self.resume) as journal, self._index() as index:
+            try:
+                self._refine(index, journal, totals)
+                # what a killed run left there is overwritten
+                with written(out), replacing(out, temporary=out.with_name(f".{out.name}.tmp")) as file:
+                    file.writelines(journal.merged(index))
+                if self.json is not None:
+                    with written(self.json):
+                        self.json.write_text(json.dumps(totals.summary(), indent=2) + "\n")
+            except KeyboardInterrupt:
+                if not journal.committed:
+                    raise
+                done = f"{totals.counts['images']} of {self._count(index)} images are done"
+                raise KeyboardInterrupt(f"{done}; the same command with --resume goes on") from None
+            journal.remove()
         if not self.quiet:
             print(describe(totals.summary(rows=False)))
         for doubt in totals.doubts:
@@ -105,9 +100,10 @@ class Refine(ImageOptions):
         with progress(size, "read", "B", quiet=self.quiet, unit_scale=True, leave=False) as bar:
             return EstimatesIndex(self.estimates, on_bytes=bar.update)
 
-    def _refine(self, index: EstimatesIndex, known: Known, journal: Journal, totals: Totals) -> None:
+    def _refine(self, index: EstimatesIndex, journal: Journal, totals: Totals) -> None:
         """Refine what the journal does not have yet."""
-        for record in journal.replay():
+        known = self.known()
+        for record in journal.begin(self._about(index, known), lines=index.lines):
             totals.add(record)
         refiner = PhysPoseRefiner(self.config)
         chosen = index.choose(self.scenes, self.every)
@@ -141,7 +137,7 @@ class Refine(ImageOptions):
         return {
             "version": __version__,
             "estimates (SHA-256)": index.digest,
-            **{f"{name} (SHA-256)": None if path is None else _digest(path) for name, path in files.items()},
+            **{f"{name} (SHA-256)": _digest(path) for name, path in files.items()},
             **{f"--{name}": None if path is None else str(path.resolve()) for name, path in folders.items()},
             **{f"--{name.replace('_', '-')}": value for name, value in options.items()},
             "--config": dataclasses.asdict(self.config),
@@ -205,6 +201,6 @@ def _record(batch: Sequence[ImageScene], groups: Sequence[_Group], estimates: Es
     }
 
 
-def _digest(path: Path) -> str:
-    """SHA-256 of a file; of a small one, so it is read as a whole."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+def _digest(path: Path | None) -> str | None:
+    """SHA-256 of a file that was read as a whole before; None: of a pipe, which cannot be read again."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path is not None and path.is_file() else None

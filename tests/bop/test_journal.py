@@ -17,24 +17,28 @@ BATCHES = [([(2, "ONE\r\n"), (5, "THREE")], {"n": 1}), ([], {"n": 2}), ([(3, "{Z
 MERGED = [b"head\n", b"ONE\r\n", "{Zwölf},\r".encode(), b"\n", b"THREE"]
 
 
-def begin(path, **options):
-    return Journal(path, ABOUT, lines=len(LINES), **{"resume": True, **options})
+def resumed(path):
+    return Journal(path, resume=True)
+
+
+def begin(journal, about=ABOUT):
+    return [record["n"] for record in journal.begin(about, lines=len(LINES))]
 
 
 @pytest.fixture
 def path(tmp_path):
     """A journal of all batches."""
     path = tmp_path / "out.csv.journal"
-    with begin(path) as journal:
-        assert list(journal.replay()) == []
+    with resumed(path) as journal:
+        assert begin(journal) == []
         for batch in BATCHES:
             journal.commit(*batch)
     return path
 
 
 def test_rows_are_merged_with_the_line_ends_of_the_file(path):
-    with begin(path) as journal:
-        assert [record["n"] for record in journal.replay()] == [1, 2, 3]
+    with resumed(path) as journal:
+        assert begin(journal) == [1, 2, 3]
         assert list(journal.merged(LINES)) == MERGED
 
 
@@ -47,8 +51,8 @@ def test_torn_anywhere_what_was_committed_is_kept_and_the_rest_can_follow(path):
     seen = set()
     for text in torn:
         path.write_bytes(text)
-        with begin(path) as journal:
-            done = len(list(journal.replay()))
+        with resumed(path) as journal:
+            done = len(begin(journal))
             assert done == journal.committed <= 2 or text == content[:-1]
             for batch in BATCHES[done:]:
                 journal.commit(*batch)
@@ -60,25 +64,25 @@ def test_torn_anywhere_what_was_committed_is_kept_and_the_rest_can_follow(path):
 
 def test_a_journal_without_records_is_not_left_behind(tmp_path):
     path = tmp_path / "j"
-    with begin(path) as journal:
+    with resumed(path) as journal:
         assert path.exists()
-        list(journal.replay())
+        begin(journal)
     assert not path.exists()
 
 
 def test_an_earlier_journal_is_refused_without_resume_and_kept(path):
     content = path.read_bytes()
     with pytest.raises(DataError, match=r"out\.csv\.journal: an earlier run .* --resume, or delete"):
-        begin(path, resume=False)
-    with begin(path):
-        pass  # not even replayed
+        Journal(path)
+    with resumed(path):
+        pass  # not even begun
     assert path.read_bytes() == content
 
 
 def test_what_differs_from_the_earlier_run_is_named(path):
     about = {**ABOUT, "--every": 3, "--config": {"steps": 40, "physics": {"softness": 0.002}}}
-    with pytest.raises(DataError) as error:
-        Journal(path, about, lines=5, resume=True)
+    with resumed(path) as journal, pytest.raises(DataError) as error:
+        begin(journal, about)
     assert "--every (it was 2, now 3), --config.physics.softness (it was 0.001, now 0.002)" in str(error.value)
     assert "steps" not in str(error.value)
 
@@ -89,7 +93,7 @@ def test_a_foreign_file_is_not_touched(tmp_path, content):
     path.write_text(content)
     for resume in (False, True):
         with pytest.raises(DataError, match="no journal"):
-            begin(path, resume=resume)
+            Journal(path, resume=resume)
     assert path.read_text() == content
 
 
@@ -98,7 +102,7 @@ def test_two_runs_are_kept_apart_and_the_lock_of_a_killed_one_is_none(path):
 import sys, time
 from pathlib import Path
 from physpose_torch.bop.journal import Journal
-j = Journal(Path({str(path)!r}), {ABOUT!r}, lines=5, resume=True)
+j = Journal(Path({str(path)!r}), resume=True)
 print("open", flush=True)
 time.sleep(60)
 """
@@ -106,21 +110,21 @@ time.sleep(60)
         assert other.stdout.readline() == b"open\n"
         for resume in (False, True):
             with pytest.raises(DataError, match="another physpose refine is writing there"):
-                begin(path, resume=resume)
+                Journal(path, resume=resume)
         other.send_signal(signal.SIGKILL)
         other.wait()
-    with begin(path) as journal:
-        assert len(list(journal.replay())) == 3
+    with resumed(path) as journal:
+        assert len(begin(journal)) == 3
         with pytest.raises(DataError, match="another"):
-            begin(path)
+            resumed(path)
 
 
 def test_a_full_disk_is_told_with_the_path_and_what_was_committed_is_kept(path):
     """The file may not grow beyond 20 bytes more."""
     content = path.read_bytes()
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    with begin(path) as journal:
-        list(journal.replay())
+    with resumed(path) as journal:
+        begin(journal)
         resource.setrlimit(resource.RLIMIT_FSIZE, (len(content) + 20, limits[1]))
         try:
             with pytest.raises(DataError, match=r"out\.csv\.journal: cannot be written \(File too large\)"):
@@ -137,4 +141,4 @@ def test_a_folder_that_cannot_be_written_is_told():
     from pathlib import Path
 
     with pytest.raises(DataError, match=r"/proc/out\.csv\.journal: cannot be written"):
-        begin(Path("/proc/out.csv.journal"))
+        resumed(Path("/proc/out.csv.journal"))
