@@ -279,6 +279,28 @@ def test_resume_without_an_earlier_run_begins(dataset, undisturbed):
     assert result(dataset) == undisturbed
 
 
+def test_progress_tells_rate_and_time_left_and_goes_on_where_it_was(dataset, monkeypatch, capsys):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    loud = [a for a in arguments(dataset) if a != "--quiet"]
+    with monkeypatch.context() as patch:
+        stop_after(2, patch)
+        assert main(loud) == 130
+    assert re.search(r"refine: +\d+%.* \d+/27 \[\d\d:\d\d<\S+, \S+(image/s|s/image)\]", capsys.readouterr().err)
+    assert main([*loud, "--resume"]) == 1
+    shown = re.findall(r" (\d+)/27 ", capsys.readouterr().err)
+    assert int(shown[0]) >= 4
+    assert shown[-1] == "27"
+
+
+def test_the_summary_can_go_to_a_pipe(dataset, undisturbed):
+    read, write = os.pipe()
+    with open(read) as reader:
+        assert refine(dataset, "--json", f"/dev/fd/{write}") == 1
+        os.close(write)
+        content = json.loads(reader.read())
+    assert content["problems"] == undisturbed[1]["problems"]
+
+
 def test_a_second_run_with_the_same_out_is_refused(dataset, undisturbed, few_at_a_time, monkeypatch, capsys):
     refine_batch, codes = module._refine, []
 

@@ -120,6 +120,7 @@ class Refine(ImageOptions):
                     for image in batch:
                         image.scene = None  # its memory is needed for the next ones
                     bar.update(len(batch))
+            bar.update(bool(index.unplaced))
         if index.unplaced:
             totals.counts["images"] += 1
             totals.problems += index.unplaced
