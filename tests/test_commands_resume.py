@@ -216,6 +216,22 @@ def test_interrupted_while_the_result_is_written_nothing_is_refined_again(datase
     assert result(dataset) == undisturbed
 
 
+def test_killed_while_the_result_is_written_nothing_is_left_behind_in_the_end(dataset, undisturbed, monkeypatch):
+    def merged(self, lines):
+        yield from itertools.islice(lines, 3)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module.Journal, "merged", merged)
+        with child(dataset) as pid:
+            assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == -signal.SIGKILL
+    assert left_over(dataset) == [".out.csv.tmp", "out.csv.journal"]
+    assert not (dataset / "out.csv").exists()
+    assert refine(dataset, "--resume") == 1
+    assert left_over(dataset) == []
+    assert result(dataset) == undisturbed
+
+
 def test_interrupted_before_anything_is_done_nothing_is_left(dataset, monkeypatch, capsys):
     def interrupt(*_):
         raise KeyboardInterrupt

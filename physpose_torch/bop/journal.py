@@ -171,9 +171,7 @@ class Journal:
                     places[int(number)] = at + len(number) + 1
                     crc = zlib.crc32(line, crc)
                 at += len(line)
-        self._end = end
-        with written(self.path):
-            self._file.truncate(end)
+        self._end = end  # the next commit cuts off what is torn
 
     def _append(self, data: bytes) -> None:
         with written(self.path):

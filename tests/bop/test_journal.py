@@ -8,6 +8,7 @@ import sys
 
 import pytest
 
+from physpose_torch.bop import journal as module
 from physpose_torch.bop.journal import Journal
 from physpose_torch.errors import DataError
 
@@ -115,6 +116,22 @@ time.sleep(60)
         other.wait()
     with resumed(path) as journal:
         assert len(begin(journal)) == 3
+        with pytest.raises(DataError, match="another"):
+            resumed(path)
+
+
+def test_a_journal_that_its_run_deletes_while_another_waits_for_it_is_not_taken(tmp_path, monkeypatch):
+    """The lock of a deleted file would keep nobody out."""
+    path, lock = tmp_path / "j", module._lock
+
+    def late(file, path):
+        monkeypatch.setattr(module, "_lock", lock)
+        path.unlink()
+        lock(file, path)
+
+    monkeypatch.setattr(module, "_lock", late)
+    with resumed(path):
+        assert path.exists()
         with pytest.raises(DataError, match="another"):
             resumed(path)
 
