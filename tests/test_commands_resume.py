@@ -290,6 +290,28 @@ def test_batch_json_and_quiet_may_change_on_resume(dataset, undisturbed, monkeyp
     assert result(dataset) == undisturbed
 
 
+@pytest.mark.parametrize("stop", [1, 2, 4, 5])
+def test_a_resumed_run_refines_the_batches_that_an_undisturbed_one_does(dataset, monkeypatch, stop):
+    """Sums round differently in other batches."""
+    monkeypatch.setattr(module, "AT_A_TIME", 7)
+    refine_batch, batches = module._refine, []
+
+    def noting(images, *args):
+        batches.append([i.im_id for i in images])
+        return refine_batch(images, *args)
+
+    monkeypatch.setattr(module, "_refine", noting)
+    assert refine(dataset, "--batch", "3") == 1
+    undisturbed = list(batches)
+    assert {len(b) for b in batches} == {1, 2, 3}
+    batches.clear()
+    with monkeypatch.context() as patch:
+        stop_after(stop, patch)
+        assert refine(dataset, "--batch", "3") == 130
+    assert refine(dataset, "--batch", "3", "--resume") == 1
+    assert batches == undisturbed
+
+
 def test_resume_without_an_earlier_run_begins(dataset, undisturbed):
     assert refine(dataset, "--resume") == 1
     assert result(dataset) == undisturbed

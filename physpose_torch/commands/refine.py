@@ -53,7 +53,8 @@ class Refine(ImageOptions):
     out: Path
     """Result file to write."""
     resume: bool = False
-    """Go on where an earlier run with the same files and options stopped; if none did, begin."""
+    """Go on where an earlier run with the same files and options stopped; if none did, begin. Only --batch, --json and
+    --quiet may differ; poses from other batches are equal but for rounding."""
     preset: str = "default"
     """default; lm: the same cost by fifteen Gauss-Newton steps; or paper: the paper's cost and gradient descent."""
     calibration: Path | None = None
@@ -107,10 +108,11 @@ class Refine(ImageOptions):
             totals.add(record)
         refiner = PhysPoseRefiner(self.config)
         chosen = index.choose(self.scenes, self.every)
-        done = totals.counts["images"]
+        done, size = totals.counts["images"], max(AT_A_TIME, self.batch)
         with progress(self._count(index), "refine", "image", quiet=self.quiet, initial=done) as bar:
-            for start in range(done, len(chosen), size := max(AT_A_TIME, self.batch)):
-                keys = [(s, i) for s, i in index.keys[chosen[start : start + size]].tolist()]
+            # sums round differently in other batches, so those of a resumed run begin and end where they would have
+            while (start := totals.counts["images"]) < len(chosen):
+                keys = [(s, i) for s, i in index.keys[chosen[start : start - start % size + size]].tolist()]
                 estimates = index.read(index.numbers([*keys, *known.partners(keys)]))
                 for batch in in_batches(known.images(estimates, keys), self.batch):
                     groups = together(batch, lambda images, rows=estimates: _refine(images, rows, refiner))
