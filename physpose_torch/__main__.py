@@ -10,6 +10,14 @@ __all__ = ["main"]
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code: 0 only if all went well."""
+    try:
+        return _run(argv)
+    except KeyboardInterrupt as interrupt:
+        print("; ".join(["physpose: interrupted", *map(str, interrupt.args)]), file=sys.stderr)
+        return 130
+
+
+def _run(argv: Sequence[str] | None) -> int:
     from physpose_torch.commands import parse
     from physpose_torch.errors import PhysPoseError
 
@@ -23,9 +31,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader, head say, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except KeyboardInterrupt:
-        print("physpose: interrupted", file=sys.stderr)
-        return 130
 
 
 if __name__ == "__main__":

@@ -5,13 +5,11 @@ ids and scores as numpy arrays. What is broken in one row or one image is report
 run over a thousand others; only a file that cannot be read as a whole raises `DataError`.
 """
 
-import contextlib
 import json
 import math
 import os
 import re
-import uuid
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from physpose_torch.bop.atomic import replacing
 from physpose_torch.errors import DataError, InvalidInputError
 
 __all__ = [
@@ -28,10 +27,14 @@ __all__ = [
     "StaticRecord",
     "Target",
     "load_json",
+    "make_estimates",
+    "parse_rows",
     "read_estimates",
     "read_planes",
     "read_statics",
     "read_targets",
+    "refuse_metres",
+    "rewrite_rows",
     "write_estimates",
 ]
 
@@ -83,9 +86,16 @@ class Estimates:
     """Every line of the file as read, line ends included."""
     problems: tuple[RowProblem, ...] = ()
     """Rows that cannot be used, in file order."""
+    numbers: np.ndarray | None = None
+    """(len(text),) int64, ascending: the 1-based line of each text, where only some of the file's were read; None: all were."""
 
     def __len__(self) -> int:
         return len(self.scene_id)
+
+    @property
+    def place(self) -> np.ndarray:
+        """(rows,) int64, index in `text` of each row."""
+        return self.line - 1 if self.numbers is None else np.searchsorted(self.numbers, self.line)
 
 
 class PlaneRecord(NamedTuple):
@@ -154,30 +164,92 @@ def read_estimates(path: str | os.PathLike) -> Estimates:
     """
     path = Path(path)
     lines = re.findall(r"[^\r\n]*(?:\r\n|\r|\n)|[^\r\n]+", _read_text(path))
+    rows, problems, header = parse_rows(path, enumerate(lines, start=1))
+    if not rows and not header:
+        raise no_result_file(path, problems)
+    refuse_metres(path, [depth for depth in (row[6][2] for row in rows) if depth > 0])
+    return make_estimates(path, rows, problems, lines)
+
+
+def parse_rows(
+    path: Path, lines: Iterable[tuple[int, str]], *, started: bool = False
+) -> tuple[list[tuple], list[RowProblem], bool]:
+    """The rows among (number, text) lines of a BOP result CSV, see `read_estimates`; poses are not looked at yet.
+
+    Args:
+        path: The file, for messages.
+        lines: In file order; numbers are 1-based.
+        started: Rows or a header came before these lines, so none of them is a header.
+
+    Returns:
+        (line number, scene_id, im_id, obj_id, score, R as 9 numbers, t as 3 [mm], time [s]) of each row; the rows that are
+        not of this form; and whether there was a header.
+
+    Raises:
+        DataError: The header is another one.
+    """
     rows, problems, header = [], [], False
-    for number, line in enumerate(lines, start=1):
+    for number, line in lines:
         fields = [field.strip() for field in line.lstrip("\ufeff").split(",")]
         if fields == [""]:
             continue
-        if not rows and not problems and not header and any(field.lower() in ("scene_id", "im_id") for field in fields):
+        if not started and any(field.lower() in ("scene_id", "im_id") for field in fields):
             if tuple(field.lower() for field in fields) != tuple(column.lower() for column in _COLUMNS):
                 raise DataError(f"{path}, line {number}: the header is {line.strip()!r}, expected {','.join(_COLUMNS)}")
-            header = True
+            started = header = True
             continue
+        started = True
         try:
             rows.append((number, *_parse_row(fields)))
         except ValueError as error:
             ids = [int(field) if re.fullmatch(r"\d{1,9}", field) else None for field in (*fields, "")[:2]]
             problems.append(RowProblem(number, *ids, f"{path}, line {number}: {error}; correct or remove the row"))
-    if not rows and not header:
-        first = f"; {problems[0].message}" if problems else ""
-        raise DataError(f"{path}: no BOP result CSV, expected rows of {','.join(_COLUMNS)}{first}")
+    return rows, problems, header
+
+
+def no_result_file(path: Path, problems: Sequence[RowProblem]) -> DataError:
+    """The error to raise for a file that has neither a row nor a header."""
+    first = f"; {problems[0].message}" if problems else ""
+    return DataError(f"{path}: no BOP result CSV, expected rows of {','.join(_COLUMNS)}{first}")
+
+
+def refuse_metres(path: Path, depths: Sequence[float], count: int | None = None) -> None:
+    """Refuse a file whose median depth says that it is in metres.
+
+    Args:
+        path: The file.
+        depths: The positive t_z of its rows [mm]; those below 10 mm are enough.
+        count: How many positive ones there are in all; None: these.
+
+    Raises:
+        DataError: It is below 10 mm.
+    """
+    middle = ((len(depths) if count is None else count) - 1) // 2
+    if 0 <= middle < len(depths) and (depth := sorted(depths)[middle]) < 10:
+        raise DataError(f"{path}: the median depth t_z is {depth:.3g} mm; BOP wants millimetres: multiply t by 1000")
+
+
+def make_estimates(
+    path: Path,
+    rows: Sequence[tuple],
+    problems: Sequence[RowProblem],
+    text: Sequence[str],
+    numbers: np.ndarray | None = None,
+) -> Estimates:
+    """Estimates of what `parse_rows` returned; rows with poses that cannot be used join the problems.
+
+    Args:
+        path: The file they were read from.
+        rows: In file order.
+        problems: Rows that cannot be used.
+        text: The lines that were read.
+        numbers: Their 1-based numbers, ascending; None: they are all of the file's.
+    """
+    problems = list(problems)
     columns = list(zip(*rows, strict=True)) or [()] * 8
     line, scene_id, im_id, obj_id = (np.array(column, dtype=np.int64) for column in columns[:4])
     R = torch.tensor(columns[5], dtype=torch.float64).reshape(-1, 3, 3)
     t = torch.tensor(columns[6], dtype=torch.float64).reshape(-1, 3)
-    if (t[:, 2] > 0).any() and (depth := t[t[:, 2] > 0, 2].median().item()) < 10:
-        raise DataError(f"{path}: the median depth t_z is {depth:.3g} mm; BOP wants millimetres: multiply t by 1000")
     keep = np.ones(len(rows), dtype=bool)
     for index, message in _bad_poses(R, t):
         keep[index] = False
@@ -190,7 +262,7 @@ def read_estimates(path: str | os.PathLike) -> Estimates:
     score, time = (np.array(columns[i], dtype=np.float64)[keep] for i in (4, 7))
     ordered = tuple(sorted(problems, key=lambda problem: problem.line))
     ids = (scene_id[keep], im_id[keep], obj_id[keep])
-    return Estimates(path, *ids, score, T, time, line[keep], tuple(lines), ordered)
+    return Estimates(path, *ids, score, T, time, line[keep], tuple(text), ordered, numbers)
 
 
 def write_estimates(path: str | os.PathLike, estimates: Estimates, poses: Any, *, time: Any = None) -> None:
@@ -210,6 +282,17 @@ def write_estimates(path: str | os.PathLike, estimates: Estimates, poses: Any, *
             within an image, or a folder that does not exist.
     """
     path = Path(path)
+    lines, place = list(estimates.text), estimates.place.tolist()
+    for row, text in rewrite_rows(estimates, poses, time=time):
+        lines[place[row]] = text
+    if not path.parent.is_dir():
+        raise InvalidInputError(f"{path}: the folder {path.parent} does not exist; create it first")
+    with replacing(path) as file:
+        file.write("".join(lines).encode())
+
+
+def rewrite_rows(estimates: Estimates, poses: Any, *, time: Any = None) -> list[tuple[int, str]]:
+    """(row, text with its line end) of each row that new poses or times change; arguments and errors of `write_estimates`."""
     poses = torch.as_tensor(poses).detach().to("cpu", torch.float64)
     if poses.shape != (len(estimates), 4, 4):
         raise InvalidInputError(f"poses have shape {tuple(poses.shape)}, expected ({len(estimates)}, 4, 4)")
@@ -223,25 +306,19 @@ def write_estimates(path: str | os.PathLike, estimates: Estimates, poses: Any, *
     for key, seconds in zip(zip(estimates.scene_id, estimates.im_id, strict=True), added, strict=True):
         if per_image.setdefault(key, seconds) != seconds:
             raise InvalidInputError(f"time differs within scene {key[0]}, image {key[1]}; BOP wants one per image")
-    lines = list(estimates.text)
-    R, t = poses[:, :3, :3].flatten(1).tolist(), (poses[:, :3, 3] / _MM).tolist()
-    for index, number in enumerate(estimates.line.tolist()):
-        fields = lines[number - 1].split(",")
-        if changed[index]:
-            fields[4], fields[5] = (" ".join(map(repr, numbers)) for numbers in (R[index], t[index]))
-        if added[index] != 0 and estimates.time[index] >= 0:
+    rewritten = []
+    later = (added != 0) & (estimates.time >= 0)
+    place = estimates.place
+    for row in np.flatnonzero(changed.numpy() | later).tolist():
+        fields = estimates.text[place[row]].split(",")
+        if changed[row]:
+            for column, numbers in ((4, poses[row, :3, :3].flatten()), (5, poses[row, :3, 3] / _MM)):
+                fields[column] = " ".join(map(repr, numbers.tolist()))
+        if later[row]:
             end = re.search(r"[\r\n]*$", fields[6]).group()
-            fields[6] = repr(float(estimates.time[index] + added[index])) + end
-        lines[number - 1] = ",".join(fields)
-    if not path.parent.is_dir():
-        raise InvalidInputError(f"{path}: the folder {path.parent} does not exist; create it first")
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
-    try:
-        temporary.write_bytes("".join(lines).encode())
-        os.replace(temporary, path)
-    finally:
-        with contextlib.suppress(FileNotFoundError):
-            temporary.unlink()
+            fields[6] = repr(float(estimates.time[row] + added[row])) + end
+        rewritten.append((row, ",".join(fields)))
+    return rewritten
 
 
 def read_planes(path: str | os.PathLike) -> tuple[dict[tuple[int, int], PlaneRecord], list[RowProblem]]:

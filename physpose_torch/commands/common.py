@@ -23,9 +23,10 @@ def check_output(*paths: Path | None) -> None:
             raise DataError(f"{path} {what}; name a file to write")
 
 
-def progress(total: int, what: str, unit: str, *, quiet: bool = False) -> tqdm:
-    """A progress bar on stderr; silent if asked, or where nobody watches."""
-    return tqdm(total=total, desc=what, unit=unit, disable=quiet or not sys.stderr.isatty(), dynamic_ncols=True)
+def progress(total: int | None, what: str, unit: str, *, quiet: bool = False, **options: Any) -> tqdm:
+    """A progress bar on stderr, with rate and time left; silent if asked, or where nobody watches. Options are tqdm's."""
+    off = quiet or not sys.stderr.isatty()
+    return tqdm(total=total, desc=what, unit=unit, disable=off, dynamic_ncols=True, **options)
 
 
 def table(header: list[str], rows: list[list[Any]]) -> str:

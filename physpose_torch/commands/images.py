@@ -10,14 +10,14 @@ import numpy as np
 import tyro
 
 from physpose_torch.bop.dataset import BopDataset
-from physpose_torch.bop.formats import Estimates, read_estimates, read_planes, read_statics
+from physpose_torch.bop.formats import Estimates, PlaneRecord, StaticRecord, read_estimates, read_planes, read_statics
 from physpose_torch.bop.scenes import BodyLibrary, ImageScene, image_scenes
-from physpose_torch.bop.table import TablesOnTheWay, read_pairs
+from physpose_torch.bop.table import Pair, TablesOnTheWay, read_pairs
 from physpose_torch.config import TableConfig
 from physpose_torch.errors import InvalidInputError, PhysPoseError
 from physpose_torch.table.estimator import TableEstimator
 
-__all__ = ["ImageOptions", "Images", "in_batches", "together"]
+__all__ = ["ImageOptions", "Images", "Known", "in_batches", "together"]
 
 
 T = TypeVar("T")
@@ -73,58 +73,106 @@ class ImageOptions:
             InvalidInputError: an option out of range.
             DataError: a file is missing or broken as a whole.
         """
+        self.check()
+        estimates = read_estimates(self.estimates)
+        known = self.known()
+        readable = dict.fromkeys(zip(estimates.scene_id.tolist(), estimates.im_id.tolist(), strict=True))
+        lost = {(p.scene_id, p.im_id): None for p in estimates.problems if None not in (p.scene_id, p.im_id)}
+        keys = [k for k in {**readable, **lost} if not self.scenes or k[0] in self.scenes][:: self.every]
+        unplaced = [p.message for p in estimates.problems if None in (p.scene_id, p.im_id)]
+        rest = [ImageScene(-1, -1, np.zeros(0, dtype=np.int64), problems=unplaced)] if unplaced else []
+        return Images(estimates, known.dataset, len(keys) + len(rest), chain(known.images(estimates, keys), rest))
+
+    def check(self) -> None:
+        """Refuse options that are out of range.
+
+        Raises:
+            InvalidInputError: the first one.
+        """
         if not self.plane_sigma_mm >= 0:
             raise InvalidInputError(f"--plane-sigma-mm {self.plane_sigma_mm}: expected a number >= 0")
         if self.batch < 1 or self.every < 1:
             raise InvalidInputError(f"--batch {self.batch}, --every {self.every}: expected positive numbers")
-        estimates = read_estimates(self.estimates)
+        if self.table is None and self.pairs is not None:
+            raise InvalidInputError(f"--pairs {self.pairs} says where second images are; add --table auto to use them")
+
+    def known(self) -> "Known":
+        """Read what is known about the images, but for the estimates.
+
+        Raises:
+            DataError: a file is missing or broken as a whole.
+        """
         dataset = BopDataset(self.dataset, split=self.split, models=self.models, targets=self.targets)
-        broken: dict[tuple[int, int], list[str]] = {}
-        unplaced = []
-        planes = None
-        bad = list(estimates.problems)
-        if self.planes is not None:
-            planes, bad_planes = read_planes(self.planes)
-            bad += bad_planes
-        for problem in bad:
-            if problem.scene_id is None or problem.im_id is None:
-                unplaced.append(problem.message)
-            else:
-                broken.setdefault((problem.scene_id, problem.im_id), []).append(problem.message)
+        planes, bad_planes = read_planes(self.planes) if self.planes is not None else (None, [])
         counts = {}
         if dataset.targets_path is not None:  # never from the ground truth
             counts = {(t.scene_id, t.im_id, t.obj_id): t.inst_count for t in dataset.targets}
-        statics = read_statics(self.statics) if self.statics is not None else []
-        readable = dict.fromkeys(zip(estimates.scene_id.tolist(), estimates.im_id.tolist(), strict=True))
-        keys = [k for k in {**readable, **broken} if not self.scenes or k[0] in self.scenes][:: self.every]
-        # none of these images' rows could be read; a bad plane of an image without rows harms nobody
-        bad_rows = {(p.scene_id, p.im_id) for p in estimates.problems}
-        lost = [k for k in keys if k in bad_rows and k not in readable]
-        nothing = np.zeros(0, dtype=np.int64)
-        rest = [ImageScene(*key, nothing, problems=broken[key]) for key in lost]
-        if unplaced:
-            rest.append(ImageScene(-1, -1, nothing, problems=unplaced))
+        return Known(
+            dataset=dataset,
+            library=BodyLibrary(dataset),
+            planes=planes,
+            bad_planes={(p.scene_id, p.im_id): p.message for p in bad_planes},
+            plane_sigma=self.plane_sigma_mm / 1000,
+            statics=read_statics(self.statics) if self.statics is not None else [],
+            counts=counts,
+            pairs=read_pairs(self.pairs) if self.pairs is not None else {},
+            table=None if self.table is None else TableEstimator(TableConfig(method=self.table)),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Known:
+    """What is known about the images of a result file, but for the estimates."""
+
+    dataset: BopDataset
+    library: BodyLibrary
+    planes: dict[tuple[int, int], PlaneRecord] | None
+    """By (scene_id, im_id); None: not asked for."""
+    bad_planes: dict[tuple[int, int], str]
+    """What is wrong with a plane."""
+    plane_sigma: float
+    """σ of the height of planes that state none [m]."""
+    statics: list[StaticRecord]
+    counts: dict[tuple[int, int, int], int]
+    """Number of instances by (scene_id, im_id, obj_id)."""
+    pairs: dict[tuple[int, int], Pair]
+    table: TableEstimator | None
+    """None: planes are not estimated."""
+
+    def images(self, estimates: Estimates, keys: Sequence[tuple[int, int]]) -> Iterator[ImageScene]:
+        """The images with these (scene_id, im_id): first those with usable rows, in file order and made one by one, then the
+        others in the order of ``keys``; those without a scene tell their problems."""
+        wanted = set(keys)
+        broken: dict[tuple[int, int], list[str]] = {}
+        for problem in estimates.problems:
+            if (problem.scene_id, problem.im_id) in wanted:
+                broken.setdefault((problem.scene_id, problem.im_id), []).append(problem.message)
+        for key in keys:  # a bad plane of an image without rows harms nobody
+            if key in self.bad_planes:
+                broken.setdefault(key, []).append(self.bad_planes[key])
+        readable = set(zip(estimates.scene_id.tolist(), estimates.im_id.tolist(), strict=True))
+        find_table = None
+        if self.table is not None:
+            find_table = TablesOnTheWay(estimates, self.dataset, self.pairs, self.table)
         images = image_scenes(
             estimates,
-            BodyLibrary(dataset),
-            planes=planes,
-            find_table=self._tables(estimates, dataset),
-            plane_sigma=self.plane_sigma_mm / 1000,
-            statics=statics,
-            counts=counts,
+            self.library,
+            planes=self.planes,
+            find_table=find_table,
+            plane_sigma=self.plane_sigma,
+            statics=self.statics,
+            counts=self.counts,
             broken=broken,
-            wanted=set(keys),
+            wanted=wanted,
         )
-        return Images(estimates, dataset, sum(k in readable for k in keys) + len(rest), chain(images, rest))
+        nothing = np.zeros(0, dtype=np.int64)
+        lost = [ImageScene(*key, nothing, problems=broken[key]) for key in keys if key not in readable]
+        return chain(images, lost)
 
-
-    def _tables(self, estimates: Estimates, dataset: BopDataset) -> TablesOnTheWay | None:
-        if self.table is None:
-            if self.pairs is not None:
-                raise InvalidInputError(f"--pairs {self.pairs} says where second images are; add --table auto to use them")
-            return None
-        pairs = read_pairs(self.pairs) if self.pairs is not None else {}
-        return TablesOnTheWay(estimates, dataset, pairs, TableEstimator(TableConfig(method=self.table)))
+    def partners(self, keys: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
+        """(scene_id, im_id) of the second images of these images, whose estimates are used with theirs."""
+        seconds = ((key[0], self.pairs[key].second) for key in keys if key in self.pairs)
+        return [(scene, second) for scene, second in seconds if second is not None] if self.table is not None else []
 
 
 def in_batches(images: Iterable[ImageScene], size: int) -> Iterator[list[ImageScene]]:

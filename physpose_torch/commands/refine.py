@@ -1,26 +1,37 @@
 """``physpose refine``: BOP result CSV in, refined BOP result CSV out."""
 
+import dataclasses
+import hashlib
 import json
 import logging
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from physpose_torch.bop.formats import Estimates, write_estimates
+from physpose_torch import __version__
+from physpose_torch.bop.atomic import replacing
+from physpose_torch.bop.formats import Estimates, rewrite_rows
+from physpose_torch.bop.index import EstimatesIndex
+from physpose_torch.bop.journal import Journal, written
 from physpose_torch.bop.scenes import ImageScene, poses_of
 from physpose_torch.commands.common import check_output, describe, progress
-from physpose_torch.commands.images import ImageOptions, in_batches, together
+from physpose_torch.commands.images import ImageOptions, Known, in_batches, together
+from physpose_torch.commands.totals import Totals, figures_of
 from physpose_torch.config import RefinerConfig
+from physpose_torch.errors import DataError
 from physpose_torch.refiner import PhysPoseRefiner, Refinement, silent_doubts
 from physpose_torch.report import PhysicsReport, physics_report
 from physpose_torch.scene import Scene
 
 __all__ = ["Refine"]
 
+AT_A_TIME = 256
+"""Images whose rows are read at a time, at least."""
 logger = logging.getLogger("physpose_torch")
 
 
@@ -34,10 +45,16 @@ class Refine(ImageOptions):
 
     Poses that physics contradicts too much to be put right are left as they are, as are objects with nothing below them and
     images whose objects together contradict their plane; --json lists them row by row.
+
+    The file may be of any size. OUT.journal keeps what is done until OUT is written, in one step; a run that was killed or
+    interrupted goes on with --resume, and ends with the same result.
     """
 
     out: Path
     """Result file to write."""
+    resume: bool = False
+    """Go on where an earlier run with the same files and options stopped; if none did, begin. Only --batch, --json and
+    --quiet may differ; poses from other batches are equal but for rounding."""
     preset: str = "default"
     """default; lm: the same cost by fifteen Gauss-Newton steps; or paper: the paper's cost and gradient descent."""
     calibration: Path | None = None
@@ -51,66 +68,83 @@ class Refine(ImageOptions):
 
     def __call__(self) -> int:
         check_output(self.json, self.out)
-        estimates, _, total, todo = self.open()
-        refiner = PhysPoseRefiner(self.config)
-        poses = estimates.T_camera_object.clone()
-        seconds = np.zeros(len(estimates))
-        before, after, moved = _Summary(), _Summary(), _Summary()
-        images: list[ImageScene] = []
-        righted = 0
-        left: dict[str, list[int]] = {"rejected": [], "unsupported": [], "doubted": []}
-        doubts: list[str] = []
-        with progress(total, "refine", "image", quiet=self.quiet) as bar:
-            for batch in in_batches(todo, self.batch):
-                for group in together(batch, lambda images: _refine(images, estimates, refiner)):
-                    rows = np.concatenate([i.rows for i in group.images])
-                    poses[rows] = group.result.poses
-                    seconds[rows] = group.seconds / len(group.images)
-                    result = group.result
-                    before.add(group.before)
-                    after.add(result.report)
-                    doubted = result.doubted[result.image]
-                    flags = {"rejected": result.rejected, "unsupported": result.unsupported, "doubted": doubted}
-                    for why, flag in flags.items():
-                        left[why] += rows[flag.numpy()].tolist()
-                    moved.add(result.report, ~(result.rejected | result.unsupported | doubted))
-                    righted += int(result.righted.sum())
-                    doubts += [f"{i.name}: {d}" for i, d in zip(group.images, result.doubts, strict=True) if d]
-                for image in batch:
-                    image.scene = None  # its memory is needed for the next ones
-                images += batch
-                bar.update(len(batch))
-        write_estimates(self.out, estimates, poses, time=seconds)
-        problems = [p for i in images for p in i.problems]
-        refined = [i for i in images if not i.problems]
-        summary = {
-            "images": len(images),
-            "refined": len(refined),
-            "rows": int(sum(len(i.rows) for i in refined)),
-            "righted": righted,
-            **{why: len(rows) for why, rows in left.items()},
-            "seconds_per_image": float(sum(seconds[i.rows[0]] for i in refined) / max(len(refined), 1)),
-            "before": before.figures(),
-            "after": after.figures(),
-            "after_moved": moved.figures(),
-            "left": [
-                {"line": int(estimates.line[row]), "obj_id": int(estimates.obj_id[row]), "why": why}
-                | {"scene_id": int(estimates.scene_id[row]), "im_id": int(estimates.im_id[row])}
-                for why, rows in left.items()
-                for row in rows
-            ],
-            "doubts": doubts,
-            "problems": problems,
-        }
-        if self.json is not None:
-            self.json.write_text(json.dumps(summary, indent=2) + "\n")
+        self.check()
+        out = self.out.resolve()  # of a link, the file it points to
+        if out.exists() and not out.is_file():
+            raise DataError(f"{self.out}: is no regular file; name a file to write")
+        totals = Totals()
+        with Journal(out.with_name(f"{out.name}.journal"), resume=self.resume) as journal, self._index() as index:
+            try:
+                self._refine(index, journal, totals)
+                # what a killed run left there is overwritten
+                with written(out), replacing(out, temporary=out.with_name(f".{out.name}.tmp")) as file:
+                    file.writelines(journal.merged(index))
+                if self.json is not None:
+                    with written(self.json):
+                        self.json.write_text(json.dumps(totals.summary(), indent=2) + "\n")
+            except KeyboardInterrupt:
+                if not journal.committed:
+                    raise
+                done = f"{totals.counts['images']} of {self._count(index)} images are done"
+                raise KeyboardInterrupt(f"{done}; the same command with --resume goes on") from None
+            journal.remove()
         if not self.quiet:
-            print(describe(summary))
-        for doubt in doubts:
+            print(describe(totals.summary(rows=False)))
+        for doubt in totals.doubts:
             logger.warning("%s", doubt)
-        for problem in problems:
+        for problem in totals.problems:
             logger.error(problem)
-        return 1 if problems else 0
+        return 1 if totals.problems else 0
+
+    def _index(self) -> EstimatesIndex:
+        size = self.estimates.stat().st_size if self.estimates.is_file() else None
+        with progress(size, "read", "B", quiet=self.quiet, unit_scale=True, leave=False) as bar:
+            return EstimatesIndex(self.estimates, on_bytes=bar.update)
+
+    def _refine(self, index: EstimatesIndex, journal: Journal, totals: Totals) -> None:
+        """Refine what the journal does not have yet."""
+        known = self.known()
+        for record in journal.begin(self._about(index, known), lines=index.lines):
+            totals.add(record)
+        refiner = PhysPoseRefiner(self.config)
+        chosen = index.choose(self.scenes, self.every)
+        done, size = totals.counts["images"], max(AT_A_TIME, self.batch)
+        with progress(self._count(index), "refine", "image", quiet=self.quiet, initial=done) as bar:
+            # sums round differently in other batches, so those of a resumed run begin and end where they would have
+            while (start := totals.counts["images"]) < len(chosen):
+                keys = [(s, i) for s, i in index.keys[chosen[start : start - start % size + size]].tolist()]
+                estimates = index.read(index.numbers([*keys, *known.partners(keys)]))
+                for batch in in_batches(known.images(estimates, keys), self.batch):
+                    groups = together(batch, lambda images, rows=estimates: _refine(images, rows, refiner))
+                    record = _record(batch, groups, estimates)
+                    journal.commit(_rewritten(groups, estimates), record)
+                    totals.add(record)
+                    for image in batch:
+                        image.scene = None  # its memory is needed for the next ones
+                    bar.update(len(batch))
+            bar.update(bool(index.unplaced))
+        if index.unplaced:
+            totals.counts["images"] += 1
+            totals.problems += index.unplaced
+
+    def _count(self, index: EstimatesIndex) -> int:
+        """How many images there are to look at or to complain about; rows of no image count as one."""
+        return len(index.choose(self.scenes, self.every)) + bool(index.unplaced)
+
+    def _about(self, index: EstimatesIndex, known: Known) -> dict[str, Any]:
+        """Whatever decides the result, by what it is called in messages."""
+        files = {name: getattr(self, name) for name in ("planes", "pairs", "statics")}
+        files["targets"] = known.dataset.targets_path
+        folders = {name: getattr(self, name) for name in ("dataset", "models")}
+        options = {name: getattr(self, name) for name in ("split", "scenes", "every", "table", "plane_sigma_mm")}
+        return {
+            "version": __version__,
+            "estimates (SHA-256)": index.digest,
+            **{f"{name} (SHA-256)": _digest(path) for name, path in files.items()},
+            **{f"--{name}": None if path is None else str(path.resolve()) for name, path in folders.items()},
+            **{f"--{name.replace('_', '-')}": value for name, value in options.items()},
+            "--config": dataclasses.asdict(self.config),
+        }
 
 
 @dataclass
@@ -119,6 +153,10 @@ class _Group:
     result: Refinement
     seconds: float
     before: PhysicsReport
+
+    @property
+    def rows(self) -> np.ndarray:
+        return np.concatenate([i.rows for i in self.images])
 
 
 def _refine(images: Sequence[ImageScene], estimates: Estimates, refiner: PhysPoseRefiner) -> _Group:
@@ -131,35 +169,41 @@ def _refine(images: Sequence[ImageScene], estimates: Estimates, refiner: PhysPos
     return _Group(images, result, time.perf_counter() - start, before)
 
 
-class _Summary:
-    """Penetrations and gaps of many images."""
-
-    def __init__(self) -> None:
-        self.penetration: list[torch.Tensor] = []
-        self.gap: list[torch.Tensor] = []
-
-    def add(self, report: PhysicsReport, chosen: torch.Tensor | None = None) -> None:
-        """Those of the objects that are ``chosen`` (N,); None: all."""
-        gap = report.gap if chosen is None else report.gap[chosen]
-        self.penetration.append(report.penetration if chosen is None else report.penetration[chosen])
-        self.gap.append(gap[gap.isfinite()])
-
-    def figures(self) -> dict[str, float]:
-        deep = torch.cat([torch.zeros(0, dtype=torch.float64), *self.penetration]) * 1e3
-        gap = torch.cat([torch.zeros(0, dtype=torch.float64), *self.gap]) * 1e3
-        return {
-            "penetration_mean_mm": _mean(deep),
-            "penetration_p95_mm": _quantile(deep, 0.95),
-            "penetrating_3mm": _mean((deep > 3).double()),
-            "gap_mean_mm": _mean(gap),
-            "gap_p95_mm": _quantile(gap, 0.95),
-            "floating_3mm": _mean((gap > 3).double()),
-        }
+def _rewritten(groups: Sequence[_Group], estimates: Estimates) -> list[tuple[int, str]]:
+    """(line number, new text) of the rows of a batch that changed."""
+    poses, seconds = estimates.T_camera_object.clone(), np.zeros(len(estimates))
+    for group in groups:
+        poses[group.rows] = group.result.poses
+        seconds[group.rows] = group.seconds / len(group.images)
+    return [(int(estimates.line[row]), text) for row, text in rewrite_rows(estimates, poses, time=seconds)]
 
 
-def _mean(x: torch.Tensor) -> float:
-    return float(x.mean()) if len(x) else 0.0
+def _record(batch: Sequence[ImageScene], groups: Sequence[_Group], estimates: Estimates) -> dict[str, Any]:
+    """What happened to a batch, for the journal and :meth:`Totals.add`."""
+    refined = [i for i in batch if not i.problems]
+    left: dict[str, list] = {"rejected": [], "unsupported": [], "doubted": []}
+    figures, doubts = [], []
+    for group in groups:
+        result = group.result
+        flags = (result.rejected, result.unsupported, result.doubted[result.image])
+        ids = [getattr(estimates, name)[group.rows] for name in ("line", "obj_id", "scene_id", "im_id")]
+        for rows, flag in zip(left.values(), flags, strict=True):
+            rows += np.stack(ids, axis=1)[flag.numpy()].tolist()
+        figures.append(figures_of(group.before, result.report, torch.stack(flags).any(0)))
+        doubts += [f"{i.name}: {d}" for i, d in zip(group.images, result.doubts, strict=True) if d]
+    return {
+        "images": len(batch),
+        "refined": len(refined),
+        "rows": sum(len(i.rows) for i in refined),
+        "righted": sum(int(g.result.righted.sum()) for g in groups),
+        "seconds": sum(g.seconds for g in groups),
+        "left": left,
+        "figures": figures,
+        "doubts": doubts,
+        "problems": [p for i in batch for p in i.problems],
+    }
 
 
-def _quantile(x: torch.Tensor, q: float) -> float:
-    return float(torch.quantile(x, q)) if len(x) else 0.0
+def _digest(path: Path | None) -> str | None:
+    """SHA-256 of a file that was read as a whole before; None: of a pipe, which cannot be read again."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path is not None and path.is_file() else None
