@@ -17,6 +17,8 @@ from physpose_torch.geometry.decompose import DecomposeOptions, DecomposeReport,
 __all__ = ["Body", "Plane", "is_flat", "load_mesh"]
 
 CYLINDER_SIDES = 32
+FARTHEST = 1e6
+"""[m]; no mesh has vertices beyond this."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,10 +193,14 @@ def load_mesh(mesh: trimesh.Trimesh | str | Path, *, label: str, scale: float = 
     if not (np.isfinite(scale) and scale > 0):
         raise InvalidInputError(f"{label}: scale = {scale}, expected a positive factor to metres (0.001 for mm)")
     mesh = _read_mesh(mesh, label)
-    # only geometry is kept: texture seams would split vertices
-    out = trimesh.Trimesh(np.asarray(mesh.vertices, dtype=np.float64) * scale, mesh.faces, process=False)
-    if not np.isfinite(out.vertices).all():
+    vertices, faces = np.asarray(mesh.vertices, dtype=np.float64) * scale, np.asarray(mesh.faces)
+    if not np.isfinite(vertices).all():
         raise DataError(f"{label}: the mesh has NaN or infinite vertices")
+    farthest = np.abs(vertices).max()
+    if farthest > FARTHEST:
+        raise DataError(f"{label}: the mesh has coordinates up to {farthest:.3g} m; it is damaged, or its scale is wrong")
+    # only geometry is kept: texture seams would split vertices
+    out = trimesh.Trimesh(vertices, faces, process=False)
     out.merge_vertices(merge_tex=True, merge_norm=True)
     return out
 
@@ -217,6 +223,13 @@ def _read_mesh(mesh: trimesh.Trimesh | str | Path, label: str) -> trimesh.Trimes
         )
     if len(mesh.faces) == 0:
         raise DataError(f"{label}: the mesh has no faces; convex parts need a surface")
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        shapes = f"vertices {vertices.shape} and faces {faces.shape}"
+        raise DataError(f"{label}: the mesh has {shapes}, expected (V, 3) and (F, 3); export it as triangles")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        wrong = int(faces.min()) if faces.min() < 0 else int(faces.max())
+        raise DataError(f"{label}: a face names vertex {wrong}, but the mesh has {len(vertices)}; the file is damaged")
     return mesh
 
 

@@ -135,7 +135,9 @@ def _refuse_entities(text: bytes, path: Path) -> None:
     parser.StartDoctypeDeclHandler = refuse
     try:
         parser.Parse(text, True)
-    except expat.ExpatError as error:
+    except DataError:
+        raise
+    except (expat.ExpatError, LookupError, ValueError) as error:  # not well-formed, or in an encoding that there is not
         raise DataError(f"{path} is not XML: {error}; expected a URDF file") from error
 
 
