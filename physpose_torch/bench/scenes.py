@@ -25,7 +25,7 @@ from physpose_torch.commands import PRESETS
 from physpose_torch.commands.common import table
 from physpose_torch.config import RefinerConfig
 from physpose_torch.errors import InvalidInputError
-from physpose_torch.refiner import PhysPoseRefiner
+from physpose_torch.refiner import PhysPoseRefiner, silent_doubts
 
 __all__ = ["bench_scenes", "make_config", "scenes_table", "seconds_per_iteration"]
 
@@ -154,7 +154,8 @@ def seconds_per_iteration(batch, config: RefinerConfig, device: torch.device, *,
 
 def _refine(batch, config: RefinerConfig):
     scene, poses, scores = batch
-    return PhysPoseRefiner(config)(poses, scene, scores=scores)
+    with silent_doubts():
+        return PhysPoseRefiner(config)(poses, scene, scores=scores)
 
 
 def _batch(images, count, repeat, device):

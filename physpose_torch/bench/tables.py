@@ -27,7 +27,7 @@ from physpose_torch.contacts import object_heights
 from physpose_torch.distance.smoothing import tangent_basis
 from physpose_torch.errors import InvalidInputError, TableNotFoundError
 from physpose_torch.geometry.body import Body, Plane
-from physpose_torch.refiner import PhysPoseRefiner
+from physpose_torch.refiner import PhysPoseRefiner, silent_doubts
 from physpose_torch.scene import Scene
 from physpose_torch.table.estimator import TableEstimate, TableEstimator
 from physpose_torch.table.view import View
@@ -250,9 +250,11 @@ def _one_draw(scene: TableScene, bodies, draw, views, bias, estimators, options,
         if options.downstream and estimate is not None:
             truth = Scene.tabletop(bodies, scene.plane)
             if not with_truth:
-                refined = PhysPoseRefiner()(given[0].poses, truth).poses
+                with silent_doubts():
+                    refined = PhysPoseRefiner()(given[0].poses, truth).poses
                 with_truth = {"input": _errors(given[0].poses, scene, truth), "true": _errors(refined, scene, truth)}
-            refined = PhysPoseRefiner()(given[0].poses, Scene.tabletop(bodies, estimate.plane)).poses
+            with silent_doubts():
+                refined = PhysPoseRefiner()(given[0].poses, Scene.tabletop(bodies, estimate.plane)).poses
             row["downstream"] = {**with_truth, "found": _errors(refined, scene, truth)}
         yield {"scene": scene.name, "draw": draw, "method": method, **row}
 
