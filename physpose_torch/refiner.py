@@ -190,7 +190,9 @@ class PhysPoseRefiner(nn.Module):
                 part, rows = _with_frozen(many, measured, acts, moves)
                 covariance, scores = (None if x is None else x[rows.to(x.device)] for x in (covariance, scores))
             at = rows.to(measured.device)
-            prior = whole.of(rows, part) if part is not many else whole
+            prior = whole
+            if part is not many:  # what is known of the others tells depths, too
+                prior = make_prior(measured[at], part, acts[rows], covariance, self.config.physics)
             plan = make_plan(prior, part, acts[rows], scores, self.config, given=covariance is not None)
             found = self._solve(plan.prior(prior, self.config), plan, part, callback)
             kept, left = self._put_back(found, measured[at], prior, part, acts[rows])

@@ -521,3 +521,20 @@ def test_bodies_without_a_stable_pose(table):
     result = PhysPoseRefiner()(poses, Scene.tabletop([ball, ball], table.plane))
     assert float(result.report.penetration.max()) < 1e-3
     assert float(result.report.gap.max()) < 1e-3
+
+
+def test_known_objects_tell_the_depth_of_the_others(table, box, can):
+    """Without a plane: a can that hangs 3 % too far away in a known box comes back along its ray, and gradients are those."""
+    poses = table.poses((0, 0, 0.02), (0, 0, 0.08), (0.03, 0.01, 0.08))
+    poses[1:, :3, 3] *= 1.015
+    scene = Scene([box, can, can], gravity=table.gravity, same_object=torch.tensor([0, 1, 1]))
+    mask = torch.tensor([False, True, True])
+    refine = PhysPoseRefiner(RefinerConfig(gradient="implicit"))
+    leaf = poses.clone().requires_grad_()
+    result = refine(leaf, scene, refine_only=mask)
+    assert torch.equal(result.poses[0].detach(), poses[0])
+    assert float(result.report.penetration_object[1]) < 4e-3
+    assert bool(result._solution.scene.has_static.all())
+    (gradient,) = torch.autograd.grad(result.poses[1:, :3, 3].sum(), leaf)
+    assert bool(gradient.isfinite().all())
+    assert float(gradient[1:].abs().max()) > 0.1
