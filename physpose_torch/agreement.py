@@ -16,7 +16,6 @@ from physpose_torch.scene import Scene
 __all__ = [
     "Flush",
     "Heights",
-    "Overlaps",
     "agreed_scale",
     "asked_depth",
     "asked_tilt",
@@ -69,15 +68,6 @@ class Heights(NamedTuple):
     """The nearest stable pose."""
     up: Tensor
     """(N, 3) against gravity, camera frame; zero where it is not known."""
-
-
-class Overlaps(NamedTuple):
-    """Objects that lie in one another."""
-
-    pairs: Tensor
-    """(E, 2) of objects that act, on the CPU."""
-    depth: Tensor
-    """(E,) how deep the parts of the two are in one another at most [m]; 0: not at all."""
 
 
 def look(prior: PosePrior, scene: Scene, acts: Tensor, backend: str) -> Heights:

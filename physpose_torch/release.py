@@ -18,7 +18,7 @@ from physpose_torch.agreement import (
     vertical_variance,
 )
 from physpose_torch.config import RefinerConfig
-from physpose_torch.conflicts import find_dubious, place
+from physpose_torch.conflicts import find_dubious
 from physpose_torch.prior import PosePrior, common_depth
 from physpose_torch.report import PhysicsReport
 from physpose_torch.scene import Scene
@@ -105,7 +105,6 @@ def make_plan(
     weighed = torch.ones(len(scene)) if scores is None else torch.as_tensor(scores).detach()
     weighed = weighed.to(prior.ray)
     depth = asked_depth(heights, prior, weighed)
-    placed = place(depth, prior, scene, backend=physics.backend)
     scale = ones
     if caution.least_sigma < 1 and not given:
         scale = agreed_scale(heights, prior, sigma_contact=physics.sigma_contact, least=caution.least_sigma)
@@ -116,7 +115,8 @@ def make_plan(
         own_reach = own_reach.clamp_min(LEAST_REACH).minimum(prior.reach)
         down = depth[prior.image].clamp_min(0.0) * heights.camera.clamp_min(0.0)
         reach = (own_reach + down).minimum(prior.reach)
-    dubious = find_dubious(heights, placed, surer, scene, weighed, limit=caution.conflict)
+    options = {"limit": caution.conflict, "backend": physics.backend}
+    dubious = find_dubious(heights, depth, surer, scene, weighed, **options)
     doubts = none
     if caution.doubt < math.inf:
         doubts = _doubts(heights, depth, prior, scene, caution.doubt)

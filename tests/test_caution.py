@@ -10,7 +10,7 @@ import torch
 from physpose_torch import se3
 from physpose_torch.agreement import Flush, agreed_scale, asked_depth, asked_tilt, look, scaled, weights
 from physpose_torch.config import Caution, PhysicsConfig, RefinerConfig
-from physpose_torch.conflicts import find_dubious, find_overlaps, place
+from physpose_torch.conflicts import find_dubious, find_overlaps
 from physpose_torch.contacts import find_drops
 from physpose_torch.errors import InvalidInputError
 from physpose_torch.geometry.body import Body, Plane
@@ -168,8 +168,7 @@ def dubious(poses, scene, scores=None, limit=0.02, backend="auto"):
     scores = torch.ones(len(poses)) if scores is None else scores
     heights, prior = looked(poses, scene, scores)
     depth = asked_depth(heights, prior, scores)
-    placed = place(depth, prior, scene, backend=backend)
-    return find_dubious(heights, placed, prior, scene, scores, limit=limit).tolist()
+    return find_dubious(heights, depth, prior, scene, scores, limit=limit, backend=backend).tolist()
 
 
 def test_a_false_detection_between_two_objects_pushes_neither(table, box, can):
