@@ -5,6 +5,7 @@ import json
 import os
 import random
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -128,9 +129,10 @@ class _Fatal:
         return Batch([(int(numbers[0]), "done")], {})
 
 
-def test_a_batch_whose_worker_dies_is_begun_again(tmp_path, cluster):
+def test_a_batch_whose_worker_dies_is_begun_again(tmp_path, cluster, caplog):
     found = list(refine_on_ray(_Fatal(tmp_path, ATTEMPTS - 1), [np.array([n]) for n in range(6)]))
     assert [b.rows for b in found] == [[[n, "done"]] for n in range(6)]
+    assert "a worker died; batch 3 is begun again" in caplog.messages
 
 
 def test_a_batch_that_kills_every_worker_is_left_alone_and_the_others_are_not(tmp_path, cluster):
@@ -204,3 +206,35 @@ def test_nothing_chosen_needs_no_cluster(dataset, monkeypatch):
     args = arguments(dataset, "out.csv", "--engine", "ray", "--scenes", "5")
     assert main(args) == 1  # a row of no image
     assert (dataset / "out.csv").read_bytes() == (dataset / "est.csv").read_bytes()
+
+
+@pytest.mark.slow
+def test_machines_come_and_go_and_the_result_is_the_same(dataset):
+    """Four machines, of which one loses a worker and another is lost altogether, while a fifth one joins."""
+    from ray.cluster_utils import Cluster
+
+    assert main(arguments(dataset, "alone.csv", "--batch", "1")) == 1
+    machines = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    lost = [machines.add_node(num_cpus=1) for _ in range(3)][-1]
+    machines.wait_for_nodes()
+    events = [
+        lambda: os.kill(random.choice(workers()), signal.SIGKILL),
+        lambda: machines.remove_node(lost, allow_graceful=False),
+        lambda: machines.add_node(num_cpus=1),
+    ]
+    environment = {**os.environ, "RAY_ADDRESS": machines.address, "RAY_USAGE_STATS_ENABLED": "0"}
+    command = [sys.executable, "-m", "physpose_torch", *arguments(dataset, "out.csv", "--batch", "1", "--engine", "ray")]
+    try:
+        with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as process:
+            while events and process.poll() is None:
+                if journal_of(dataset) >= 4 * (4 - len(events)) and workers():
+                    with contextlib.suppress(IndexError):  # in a moment without work
+                        events[0]()
+                        del events[0]
+                time.sleep(0.01)
+            message = process.stderr.read()
+    finally:
+        machines.shutdown()
+    assert not events, message
+    assert process.returncode == 1, message
+    assert result(dataset, "out.csv") == result(dataset, "alone.csv")

@@ -1,11 +1,13 @@
 """Where the batches of ``physpose refine`` are refined: in this process, or by the workers of a Ray cluster."""
 
+import contextlib
 import functools
 import json
 import logging
 import os
+import warnings
 from collections import Counter
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +21,7 @@ __all__ = ["refine_here", "refine_on_ray"]
 
 ATTEMPTS = 4
 """Times that a batch is begun, if its worker dies."""
+logger = logging.getLogger("physpose_torch")
 
 
 def refine_here(refine: BatchRefiner, batches: Sequence[np.ndarray]) -> Generator[Batch, None, None]:
@@ -57,8 +60,20 @@ def refine_on_ray(
         payload = [ray.put((refine, list(batches)))]
         job = _Job(__version__, os.getcwd(), os.environ.get("PHYSPOSE_CACHE"), attempts, payload)
         _check_nodes(ray, job)
+        told: set[str] = set()
         for row in _dataset(ray, job, len(batches), workers).iter_rows():
-            yield _unpacked(row["found"], refine.index.names(batches[row["number"]]))
+            found = json.loads(row["found"])
+            for message in found["messages"]:
+                if message not in told:  # every worker says so once
+                    logger.warning("%s", message)
+                    told.add(message)
+            if "error" in found:
+                raise DataError(found["error"])
+            if "batch" in found:
+                yield Batch(*found["batch"])
+            else:
+                names = refine.index.names(batches[row["number"]])
+                yield lost_batch(names, f"killed its worker {ATTEMPTS} times; try --engine local")
     finally:
         if own:
             ray.shutdown()
@@ -102,7 +117,7 @@ def _ray() -> Any:
 
 def _start(ray: Any) -> None:
     try:
-        ray.init(include_dashboard=False, logging_level=logging.ERROR)
+        ray.init(include_dashboard=False, logging_level=logging.ERROR, log_to_driver=False)
     except Exception as error:
         where = os.environ.get("RAY_ADDRESS", "on this machine")
         raise BackendError(f"--engine ray: the cluster {where} cannot be used ({error}); check RAY_ADDRESS") from None
@@ -135,17 +150,37 @@ def _dataset(ray: Any, job: _Job, count: int, workers: int | None) -> Any:
 
 
 def _refine_on_worker(row: dict[str, np.ndarray], *, job: _Job) -> dict[str, list]:
-    """{"batch": a :class:`Batch`}, {"error": message}, or {} where it has killed too many workers, as JSON."""
+    """"number", and "found", JSON: "messages" of the worker and "batch", a :class:`Batch`, or "error", what is wrong with a
+    file; neither where too many workers died of it."""
     import ray
 
-    number, found = int(row["id"][0]), {}
     refine, batches = _make_ready(job)
-    try:
-        if ray.get(job.attempts.begin.remote(number)) <= ATTEMPTS:
-            found["batch"] = refine(batches[number])
-    except PhysPoseError as error:
-        found["error"] = str(error)
+    number, found = int(row["id"][0]), {}
+    with _messages() as found["messages"]:
+        begun = ray.get(job.attempts.begin.remote(number))
+        if begun > 1:
+            logger.warning("a worker died; batch %d is begun again", number)
+        try:
+            if begun <= ATTEMPTS:
+                found["batch"] = refine(batches[number])
+        except PhysPoseError as error:
+            found["error"] = str(error)
     return {"number": [number], "found": [json.dumps(found)]}
+
+
+@contextlib.contextmanager
+def _messages() -> Iterator[list[str]]:
+    """What is logged and warned of meanwhile, for whoever watches is elsewhere."""
+    caught: list[str] = []
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: caught.append(record.getMessage())
+    logger.addHandler(handler)
+    try:
+        with warnings.catch_warnings(record=True) as warned:
+            yield caught
+    finally:
+        caught += [str(w.message) for w in warned if w.category is UserWarning]
+        logger.removeHandler(handler)
 
 
 def _make_ready(job: _Job) -> tuple[BatchRefiner, list[np.ndarray]]:
@@ -165,10 +200,3 @@ def _opened(version: str, folder: str, cache: str | None, payload: Any) -> tuple
         os.environ["PHYSPOSE_CACHE"] = cache
     torch.set_num_threads(1)
     return ray.get(payload)
-
-
-def _unpacked(found: str, keys: Sequence[tuple[int, int]]) -> Batch:
-    found = json.loads(found)
-    if "error" in found:
-        raise DataError(found["error"])
-    return Batch(*found["batch"]) if found else lost_batch(keys, f"killed its worker {ATTEMPTS} times; try --engine local")
