@@ -208,6 +208,18 @@ def test_nothing_chosen_needs_no_cluster(dataset, monkeypatch):
     assert (dataset / "out.csv").read_bytes() == (dataset / "est.csv").read_bytes()
 
 
+def test_the_benchmark_tells_rates_and_differences(dataset, cluster, capsys):
+    from physpose_torch.bench.__main__ import main as bench
+
+    args = ["engines", dataset / "est.csv", "--dataset", dataset, "--planes", dataset / "planes.json", "--preset", "lm"]
+    assert bench([*map(str, args), "--batch", "8", "--workers", "2", "--json", str(dataset / "bench.json")]) == 0
+    here, there = json.loads((dataset / "bench.json").read_text())["engines"]
+    assert (here["workers"], there["workers"]) == (0, 2)
+    assert there["images_per_second"] > 0
+    assert (there["rows_that_differ"], there["difference_mm"]) == (0, 0.0)
+    assert "Ray, 2 workers" in capsys.readouterr().out
+
+
 @pytest.mark.slow
 def test_machines_come_and_go_and_the_result_is_the_same(dataset):
     """Four machines, of which one loses a worker and another is lost altogether, while a fifth one joins."""

@@ -16,6 +16,7 @@ from typing import Annotated, Any, Union
 import torch
 import tyro
 
+from physpose_torch.bench.engines import EngineOptions, run_engines
 from physpose_torch.bench.grasp import GraspOptions, run_grasps
 from physpose_torch.bench.growth import GrowthCase, bench_growth, growth_table, sweep
 from physpose_torch.bench.images import load_images
@@ -187,6 +188,16 @@ class Stress(StressOptions, _Bench):
 
 
 @dataclass(frozen=True)
+class Engines(EngineOptions, _Bench):
+    """The engines of physpose refine: images a second, and whether the poses are those of one process."""
+
+    def run(self, results: dict[str, Any], device: torch.device) -> None:
+        if self.plot is not None or self.data is not None or self.backend or device.type != "cpu":
+            raise InvalidInputError("engines: runs on a result file on the CPU; no --plot, --data, --backend, --device")
+        run_engines(results, self)
+
+
+@dataclass(frozen=True)
 class All(_Bench):
     """Pairs, scenes and growth with modest sizes: what runs without a subcommand."""
 
@@ -211,6 +222,7 @@ COMMANDS = {
     "grasp": Grasp,
     "training": Training,
     "stress": Stress,
+    "engines": Engines,
 }
 
 

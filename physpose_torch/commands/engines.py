@@ -150,7 +150,7 @@ def _dataset(ray: Any, job: _Job, count: int, workers: int | None) -> Any:
 
 
 def _refine_on_worker(row: dict[str, np.ndarray], *, job: _Job) -> dict[str, list]:
-    """"number", and "found", JSON: "messages" of the worker and "batch", a :class:`Batch`, or "error", what is wrong with a
+    """ "number", and "found", JSON: "messages" of the worker and "batch", a :class:`Batch`, or "error", what is wrong with a
     file; neither where too many workers died of it."""
     import ray
 
