@@ -14,16 +14,16 @@ import numpy as np
 import torch
 
 from physpose_torch import __version__
-from physpose_torch.bop.atomic import replacing
 from physpose_torch.bop.formats import Estimates, rewrite_rows
 from physpose_torch.bop.index import EstimatesIndex
-from physpose_torch.bop.journal import Journal, written
+from physpose_torch.bop.journal import Journal
 from physpose_torch.bop.scenes import ImageScene, poses_of
 from physpose_torch.commands.common import check_output, describe, progress
 from physpose_torch.commands.images import ImageOptions, Known, in_batches, together
 from physpose_torch.commands.totals import Totals, figures_of
 from physpose_torch.config import RefinerConfig
 from physpose_torch.errors import DataError
+from physpose_torch.files import replacing, write_file, written
 from physpose_torch.refiner import PhysPoseRefiner, Refinement, silent_doubts
 from physpose_torch.report import PhysicsReport, physics_report
 from physpose_torch.scene import Scene
@@ -80,8 +80,7 @@ class Refine(ImageOptions):
                 with written(out), replacing(out, temporary=out.with_name(f".{out.name}.tmp")) as file:
                     file.writelines(journal.merged(index))
                 if self.json is not None:
-                    with written(self.json):
-                        self.json.write_text(json.dumps(totals.summary(), indent=2) + "\n")
+                    write_file(self.json, json.dumps(totals.summary(), indent=2) + "\n")
             except KeyboardInterrupt:
                 if not journal.committed:
                     raise
