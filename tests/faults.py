@@ -60,6 +60,21 @@ def children(text, parent):
     return found
 
 
+def ended(pid, *, within=4.0):
+    """Whether a process comes to its end in a while; nobody need have waited for it."""
+    limit = time.monotonic() + within
+    while True:
+        try:
+            state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        except OSError:
+            return True
+        if state == "Z":
+            return True
+        if time.monotonic() > limit:
+            return False
+        time.sleep(0.01)
+
+
 def gone(text, parent, *, within=3.0):
     """Whether no such child is left in a while."""
     end = time.monotonic() + within

@@ -43,7 +43,7 @@ class Report(ImageOptions):
     json: Path | None = None
     """Write every row's numbers and what could not be measured to this file."""
     backend: str = "auto"
-    """Distance backend: warp or fcl."""
+    """Distance backend: warp, fcl, or fcl-isolated (in a process of its own)."""
     quiet: bool = False
     """No progress bar and no table."""
 
