@@ -40,8 +40,8 @@ def replacing(path: Path, *, temporary: Path | None = None) -> Iterator[BinaryIO
     if path.exists() and not os.access(path, os.W_OK):
         raise PermissionError(errno.EACCES, "it is read-only")
     if temporary is None:
-        remove_abandoned(path.parent, f".{glob.escape(path.name[:100])}.*.tmp")
-        temporary = path.with_name(f".{path.name[:100]}.{uuid.uuid4().hex}.tmp")
+        remove_abandoned(path.parent, f".{glob.escape(path.name[:40])}.*.tmp")
+        temporary = path.with_name(f".{path.name[:40]}.{uuid.uuid4().hex}.tmp")
     try:
         with open(temporary, "wb") as file:
             yield file
