@@ -66,7 +66,8 @@ class DecomposeOptions:
     max_faces: int = 2000
     """The mesh is simplified to this many triangles for CoACD; vertices are put back onto the full mesh afterwards."""
     time_limit_s: float = 120.0
-    """CoACD is killed after this time [s] and the convex hull is taken instead (with a warning, and not cached)."""
+    """CoACD is killed after this time [s] and the convex hull is taken instead (with a warning, and not cached). So it is if it
+    crashes; if somebody else kills it, for want of memory say, it is tried once more before."""
     seed: int = 0
     """CoACD's random seed."""
 
@@ -126,7 +127,7 @@ _OUTSIDE = {-getattr(signal, name, 0) for name in ("SIGKILL", "SIGTERM", "SIGINT
 
 
 class _KilledError(BackendError):
-    """CoACD was killed by somebody else, the out-of-memory killer say: no fault of the mesh."""
+    """CoACD ran out of memory, or was killed by somebody else: no fault of the mesh."""
 
 
 def _run_coacd(
@@ -134,7 +135,7 @@ def _run_coacd(
 ) -> list[np.ndarray]:
     """CoACD's parts as vertex arrays [m]; BackendError if the child crashes, is stopped, or runs past the deadline.
 
-    A child that was killed from outside gets a second chance. Nothing is written to disk.
+    A child that was killed from outside, or had no memory, gets a second chance. Nothing is written to disk.
     """
     try:
         return _ask_child(vertices, faces, deadline=deadline, stop=stop, **settings)
@@ -173,7 +174,8 @@ def _ask_child(vertices, faces, *, deadline: float, stop: threading.Event, **set
         child.wait()
     if child.returncode != 0:
         tail = message.decode(errors="replace").strip().splitlines()[-1:]
-        kind = _KilledError if child.returncode in _OUTSIDE else BackendError
+        starved = any(word in message for word in (b"MemoryError", b"bad_alloc"))
+        kind = _KilledError if starved or child.returncode in _OUTSIDE else BackendError
         raise kind(" ".join([f"CoACD's process ended with code {child.returncode}", *tail]))
     with np.load(io.BytesIO(found)) as data:
         return np.split(data["vertices"], np.cumsum(data["counts"])[:-1])
@@ -325,7 +327,8 @@ def decompose(
         mesh: triangles in metres; closed or not, merged or not.
         options: tolerances and limits.
         cache: look the result up, and keep it, in ``$PHYSPOSE_CACHE/decompose`` (default: the user's cache folder).
-            The key is made of the triangles (rounded to 1e-9 m, in any order) and the options.
+            The key is made of the triangles (rounded to 1e-9 m, in any order) and the options. Where it cannot be read or
+            written there is a warning, once; what is damaged is computed anew.
         name: what errors and warnings call the mesh.
 
     Returns:

@@ -448,10 +448,19 @@ def test_eight_processes_that_fill_one_cache_at_once_get_the_same(cache, meshes,
     print("\ncache: 5 rounds of 8 processes, same result in all 40, no warning, nothing left behind")
 
 
-def test_a_child_that_cannot_be_started_means_the_hull_for_now(cache, monkeypatch):
+@pytest.mark.parametrize(
+    ("child", "message"),
+    [
+        (["/no/such/program"], "cannot be started"),
+        ([sys.executable, "-c", "raise MemoryError"], "MemoryError; its convex hull"),
+        ([sys.executable, "-c", "import os; os.write(2, b'std::bad_alloc'); os.abort()"], "bad_alloc; its convex hull"),
+    ],
+    ids=["not started", "MemoryError", "bad_alloc"],
+)
+def test_a_child_for_which_there_is_no_room_means_the_hull_for_now(cache, monkeypatch, child, message):
     folder = cache("cache")
-    monkeypatch.setattr(module, "_child_command", ["/no/such/program"])
-    with pytest.warns(UserWarning, match="cannot be started"):
+    monkeypatch.setattr(module, "_child_command", child)
+    with pytest.warns(UserWarning, match=message):
         assert decompose(l_shape()).report.method == "hull"
     assert files(folder) == []
 
