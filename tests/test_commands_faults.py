@@ -154,6 +154,18 @@ def test_a_hundred_kills_of_each_leave_its_file_whole_or_not_there(name, dataset
     print(f"\n{name}: {killed} killed, {ended} came to their end before, same result, 0 files left behind")
 
 
+@pytest.mark.parametrize(("denied", "message"), [("out.json", "is read-only"), ("folder", "lies in a read-only folder")])
+def test_where_nothing_may_be_written_nothing_is_begun(name, dataset, tmp_path, monkeypatch, capsys, denied, message):
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    if denied == "out.json":
+        (folder / denied).write_text(OLD)
+    monkeypatch.setattr(os, "access", lambda path, _: os.path.basename(path) != denied)  # root may write all
+    monkeypatch.setattr("physpose_torch.commands.images.ImageOptions.open", None)
+    assert run(name, dataset, folder / "out.json") == 2
+    assert re.search(rf"out\.(json|csv) {message}; name a file to write", capsys.readouterr().err)
+
+
 @pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("name", ["calibrate", "report"], indirect=True)
 def test_when_asked_to_stop_it_says_so_and_nothing_is_written(name, dataset, tmp_path, monkeypatch, sign):
