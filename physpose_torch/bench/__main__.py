@@ -32,6 +32,7 @@ from physpose_torch.bench.tables import TableOptions, run_tables
 from physpose_torch.bench.training import TrainingOptions, run_training
 from physpose_torch.distance.autograd import backends
 from physpose_torch.errors import InvalidInputError, PhysPoseError
+from physpose_torch.files import write_file
 
 __all__ = ["main"]
 
@@ -80,7 +81,7 @@ class _Bench(ABC):
             for note in results["notes"]:
                 print(f"note: {note}")
             if self.json is not None:
-                self.json.write_text(json.dumps(_plain(results), indent=2, allow_nan=False) + "\n")
+                write_file(self.json, json.dumps(_plain(results), indent=2, allow_nan=False) + "\n")
         if self.plot is not None:
             plot_costs(self.plot, results)
         return 0

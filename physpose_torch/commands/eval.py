@@ -16,6 +16,7 @@ from physpose_torch.bop.metrics import Recall, Scores, evaluate
 from physpose_torch.bop.residuals import Distribution, distribution, errors_against_gt
 from physpose_torch.bop.vsd import VsdDepth
 from physpose_torch.commands.common import check_output, progress, table
+from physpose_torch.files import write_file
 
 __all__ = ["Eval"]
 
@@ -72,7 +73,7 @@ class Eval:
         if self.planes is not None:
             content["inside_table"] = inside_table(estimates, dataset, planes, self.scenes)
         if self.json is not None:
-            self.json.write_text(json.dumps(content, indent=2) + "\n")
+            write_file(self.json, json.dumps(content, indent=2) + "\n")
         if not self.quiet:
             print(score_table(scores), *([note] if note else []), sep="\n\n")
             print("", errors_text(errors, counts), sep="\n")

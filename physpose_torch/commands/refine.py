@@ -12,9 +12,8 @@ from typing import Any, Literal
 import numpy as np
 
 from physpose_torch import __version__
-from physpose_torch.bop.atomic import replacing
 from physpose_torch.bop.index import EstimatesIndex
-from physpose_torch.bop.journal import Journal, written
+from physpose_torch.bop.journal import Journal
 from physpose_torch.commands.batches import BatchRefiner
 from physpose_torch.commands.common import check_output, describe, progress
 from physpose_torch.commands.engines import refine_here, refine_on_ray
@@ -22,6 +21,7 @@ from physpose_torch.commands.images import ImageOptions, Known
 from physpose_torch.commands.totals import Totals
 from physpose_torch.config import RefinerConfig
 from physpose_torch.errors import DataError, InvalidInputError
+from physpose_torch.files import replacing, write_file, written
 
 __all__ = ["Refine"]
 
@@ -80,8 +80,7 @@ class Refine(ImageOptions):
                 with written(out), replacing(out, temporary=out.with_name(f".{out.name}.tmp")) as file:
                     file.writelines(journal.merged(index))
                 if self.json is not None:
-                    with written(self.json):
-                        self.json.write_text(json.dumps(totals.summary(), indent=2) + "\n")
+                    write_file(self.json, json.dumps(totals.summary(), indent=2) + "\n")
             except KeyboardInterrupt:
                 if not journal.committed:
                     raise

@@ -25,8 +25,13 @@ GRAZING = 1e-3
 
 
 def backends() -> list[str]:
-    """Names of the distance backends that this installation can run, best first."""
-    return [name for name, module in (("warp", "warp"), ("fcl", "fcl")) if importlib.util.find_spec(module)]
+    """Names of the distance backends that this installation can run, best first.
+
+    ``warp``: NVIDIA Warp, CPU and CUDA. ``fcl``: python-fcl, CPU. ``fcl-isolated``: the same in a process of its own; should
+    it crash or hang, it is started anew, and at worst torch answers: the result is the same to 1e-9 m.
+    """
+    homes = (("warp", "warp"), ("fcl", "fcl"), ("fcl-isolated", "fcl"))
+    return [name for name, module in homes if importlib.util.find_spec(module)]
 
 
 def signed_distance(
@@ -181,10 +186,15 @@ def _fused(smoothing: Smoothing | None) -> bool:
 
 
 def _backend(name: str) -> Backend:
-    if chosen_backend(name) == "fcl":
+    name = chosen_backend(name)
+    if name == "fcl":
         from physpose_torch.distance.fcl import fcl_distance
 
         return fcl_distance
+    if name == "fcl-isolated":
+        from physpose_torch.distance.fcl_isolated import isolated_distance
+
+        return isolated_distance
     from physpose_torch.distance.warp import warp_query
 
     return warp_query
