@@ -6,6 +6,7 @@ import glob
 import os
 import re
 import shutil
+import threading
 import time
 import uuid
 from collections.abc import Iterator
@@ -16,7 +17,12 @@ import platformdirs
 
 from physpose_torch.errors import DataError
 
-__all__ = ["cache_folder", "remove_abandoned", "replacing", "write_file", "written"]
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
+__all__ = ["cache_folder", "one_at_a_time", "remove_abandoned", "replacing", "write_file", "written"]
 
 ABANDONED = 3600.0
 """[s]; a temporary file of this age is that of a killed process."""
@@ -95,6 +101,39 @@ def cache_folder(name: str) -> Path:
     if not folder.is_absolute():  # some versions of platformdirs take ~ for the name of a folder
         raise FileNotFoundError("this user has no home folder")
     return folder / name
+
+
+@contextlib.contextmanager
+def one_at_a_time(path: Path, *, patience: float, stop: threading.Event) -> Iterator[bool]:
+    """Of several processes and threads that make the same file, one is in the block and the others wait; yields whether it did.
+
+    They do so for ``patience`` [s], and until ``stop`` is set. Where there is no lock to be had nobody waits; that of a killed
+    process is no lock.
+    """
+    lock = path.with_name(f".{path.name}.lock.tmp")
+    file, waited, end = None, False, time.monotonic() + patience
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        while fcntl is not None and file is None:
+            file = open(lock, "ab")  # noqa: SIM115
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                held = os.path.samestat(os.fstat(file.fileno()), os.stat(lock))
+            except (BlockingIOError, FileNotFoundError):  # who had it has it still, or has deleted it
+                held = False
+            if held:
+                break
+            file.close()
+            file, waited = None, True
+            if time.monotonic() > end or stop.wait(0.1):
+                break
+    try:
+        yield waited
+    finally:
+        if file is not None:
+            with contextlib.suppress(OSError):
+                lock.unlink()
+            file.close()
 
 
 def remove_abandoned(folder: Path, pattern: str) -> None:

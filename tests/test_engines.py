@@ -129,6 +129,7 @@ class _Fatal:
         return Batch([(int(numbers[0]), "done")], {})
 
 
+@pytest.mark.slow
 def test_a_batch_whose_worker_dies_is_begun_again(tmp_path, cluster, caplog):
     found = list(refine_on_ray(_Fatal(tmp_path, ATTEMPTS - 1), [np.array([n]) for n in range(6)]))
     assert [b.rows for b in found] == [[[n, "done"]] for n in range(6)]
@@ -143,6 +144,7 @@ def test_a_batch_that_kills_every_worker_is_left_alone_and_the_others_are_not(tm
     assert found[3].record["refined"] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [[], ["--engine", "ray"]], ids=["local, then ray", "ray, then local"])
 def test_a_run_that_was_stopped_goes_on_with_another_engine(dataset, alone, cluster, monkeypatch, first):
     commit, then = refining_journal().commit, [] if first else ["--engine", "ray"]
@@ -166,6 +168,7 @@ def refining_journal():
     return Journal
 
 
+@pytest.mark.slow
 def test_a_file_that_changes_meanwhile_is_told(dataset, cluster, capsys, monkeypatch):
     commit = refining_journal().commit
 

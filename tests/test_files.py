@@ -13,7 +13,7 @@ from faults import exit_code, files, forked, full_disk
 
 from physpose_torch import files as module
 from physpose_torch.errors import DataError, InvalidInputError
-from physpose_torch.files import cache_folder, remove_abandoned, replacing, write_file
+from physpose_torch.files import cache_folder, one_at_a_time, remove_abandoned, replacing, write_file
 
 OLD, NEW = b"what was there before", b"0123456789" * 20_000
 
@@ -224,3 +224,52 @@ def test_a_user_without_home_has_no_cache_folder_and_none_is_made(tmp_path, monk
     with forked(work) as pid:
         assert exit_code(pid) == 0
     assert files(tmp_path) == []
+
+
+def test_one_makes_a_file_and_the_others_wait_for_it(tmp_path):
+    inside, most, never = [], [], threading.Event()
+
+    def make():
+        with one_at_a_time(tmp_path / "made", patience=60, stop=never):
+            inside.append(1)
+            most.append(len(inside))
+            time.sleep(0.02)
+            inside.pop()
+
+    threads = [threading.Thread(target=make) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert most == [1] * 8
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_who_waits_loses_patience_or_is_stopped(tmp_path):
+    stop = threading.Event()
+    with one_at_a_time(tmp_path / "made", patience=0, stop=stop):
+        start = time.monotonic()
+        with one_at_a_time(tmp_path / "made", patience=0.2, stop=stop):
+            assert time.monotonic() - start >= 0.2
+        stop.set()
+        with one_at_a_time(tmp_path / "made", patience=60, stop=stop):
+            assert time.monotonic() - start < 30
+
+
+def test_the_lock_of_a_killed_process_is_none(tmp_path):
+    never = threading.Event()
+    if (pid := os.fork()) == 0:
+        with one_at_a_time(tmp_path / "made", patience=0, stop=never):
+            os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(pid, 0)
+    assert len(list(tmp_path.iterdir())) == 1
+    start = time.monotonic()
+    with one_at_a_time(tmp_path / "made", patience=60, stop=never):
+        assert time.monotonic() - start < 30
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_where_there_is_no_lock_to_be_had_nobody_waits(tmp_path):
+    (tmp_path / "file").touch()
+    with one_at_a_time(tmp_path / "file" / "made", patience=60, stop=threading.Event()):
+        pass

@@ -21,6 +21,7 @@ __all__ = ["refine_here", "refine_on_ray"]
 
 ATTEMPTS = 4
 """Times that a batch is begun, if its worker dies."""
+CACHES = ("PHYSPOSE_CACHE", "WARP_CACHE_PATH")
 logger = logging.getLogger("physpose_torch")
 
 
@@ -58,7 +59,7 @@ def refine_on_ray(
         # in a list, for an argument itself would be read anew for every batch
         attempts = ray.remote(num_cpus=0, max_restarts=-1, max_task_retries=-1)(_Attempts).remote()
         payload = [ray.put((refine, list(batches)))]
-        job = _Job(__version__, os.getcwd(), os.environ.get("PHYSPOSE_CACHE"), attempts, payload)
+        job = _Job(__version__, os.getcwd(), {k: os.environ[k] for k in CACHES if k in os.environ}, attempts, payload)
         _check_nodes(ray, job)
         told: set[str] = set()
         for row in _dataset(ray, job, len(batches), workers).iter_rows():
@@ -85,7 +86,8 @@ class _Job(NamedTuple):
     version: str
     folder: str
     """In which paths are meant."""
-    cache: str | None
+    caches: dict[str, str]
+    """Environment variables."""
     attempts: Any
     """An actor, :class:`_Attempts`."""
     payload: list
@@ -185,18 +187,17 @@ def _messages() -> Iterator[list[str]]:
 
 def _make_ready(job: _Job) -> tuple[BatchRefiner, list[np.ndarray]]:
     """Get a worker ready, once for all its batches."""
-    return _opened(job.version, job.folder, job.cache, job.payload[0])
+    if job.version != __version__:
+        raise BackendError(f"it has physpose-torch {__version__}")
+    if os.path.isdir(job.folder):
+        os.chdir(job.folder)
+    os.environ |= job.caches
+    torch.set_num_threads(1)
+    return _opened(job.payload[0])
 
 
 @functools.lru_cache(maxsize=1)
-def _opened(version: str, folder: str, cache: str | None, payload: Any) -> tuple[BatchRefiner, list[np.ndarray]]:
+def _opened(payload: Any) -> tuple[BatchRefiner, list[np.ndarray]]:
     import ray
 
-    if version != __version__:
-        raise BackendError(f"it has physpose-torch {__version__}")
-    if os.path.isdir(folder):
-        os.chdir(folder)
-    if cache is not None:
-        os.environ["PHYSPOSE_CACHE"] = cache
-    torch.set_num_threads(1)
     return ray.get(payload)

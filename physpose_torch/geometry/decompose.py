@@ -25,7 +25,7 @@ import numpy as np
 import trimesh
 
 from ..errors import BackendError, DataError, InvalidInputError
-from ..files import cache_folder, remove_abandoned, replacing
+from ..files import cache_folder, one_at_a_time, remove_abandoned, replacing
 from .cover import Surface, clean_mesh, measure_cover
 from .hulls import few_vertices, fewest_parts, hand_out_extremes
 
@@ -228,11 +228,23 @@ def _cut_and_merge(mesh: trimesh.Trimesh, surface: Surface, options: DecomposeOp
 
 
 def _decompose(mesh, options: DecomposeOptions, cache: bool, name: str, stop: threading.Event) -> Decomposition:
-    start = time.perf_counter()
     mesh = clean_mesh(mesh, name)
     path = _cache_path(mesh, options) if cache else None
-    if path and (found := _load(path)):
+    if path is None:
+        return _work_out(mesh, options, name, stop)
+    if found := _load(path):
         return found
+    with one_at_a_time(path, patience=2 * options.time_limit_s, stop=stop) as waited:
+        if waited and (found := _load(path)):
+            return found
+        result = _work_out(mesh, options, name, stop)
+        if result.report.warning is None:  # neither a time-out nor a kill must stick
+            _store(path, result)
+        return result
+
+
+def _work_out(mesh: trimesh.Trimesh, options: DecomposeOptions, name: str, stop: threading.Event) -> Decomposition:
+    start = time.perf_counter()
     surface, warning = Surface(np.array(mesh.triangles), mesh.is_watertight), None
     whole = [few_vertices(mesh.vertices, options.max_vertices, options.tolerance)]
     method, parts, errors = "convex", whole, measure_cover(whole, surface, options.tolerance)
@@ -249,12 +261,9 @@ def _decompose(mesh, options: DecomposeOptions, cache: bool, name: str, stop: th
         warning = f"{name}: {warning}"
         if (content := _digest(mesh)) not in _warned:  # once per mesh, not on every call
             _warned.add(content)
-            warnings.warn(warning, stacklevel=3)
+            warnings.warn(warning, stacklevel=4)
     report = DecomposeReport(method, len(parts), **errors, seconds=time.perf_counter() - start, warning=warning)
-    result = Decomposition(parts, report)
-    if path and warning is None:  # neither a time-out nor a kill must stick
-        _store(path, result)
-    return result
+    return Decomposition(parts, report)
 
 
 def _digest(mesh: trimesh.Trimesh) -> bytes:
@@ -328,7 +337,7 @@ def decompose(
         options: tolerances and limits.
         cache: look the result up, and keep it, in ``$PHYSPOSE_CACHE/decompose`` (default: the user's cache folder).
             The key is made of the triangles (rounded to 1e-9 m, in any order) and the options. Where it cannot be read or
-            written there is a warning, once; what is damaged is computed anew.
+            written there is a warning, once; what is damaged is computed anew; what another process is at is waited for.
         name: what errors and warnings call the mesh.
 
     Returns:
