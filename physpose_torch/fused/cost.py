@@ -3,6 +3,7 @@
 import functools
 import os
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import torch
@@ -25,6 +26,15 @@ LEAST_ROWS = 2000
 """Fewer rows than this, some milliseconds of work, are not worth waiting for another thread."""
 LM_STILL_STEPS = 2
 """A Gauss-Newton step that moves nothing is nearly proof enough."""
+
+
+@functools.cache
+def _ready(dtype: torch.dtype, device: torch.device) -> SimpleNamespace:
+    """Kernels for a dtype, compiled for a device."""
+    initialise()
+    kernels = cost_kernels(REAL[dtype])
+    load(kernels.module, device)
+    return kernels
 
 
 @functools.cache
@@ -59,9 +69,7 @@ class _Fused:
         self.n, self.n_images = len(scene), scene.n_images
         self.device, self.dtype = poses.device, poses.dtype
         self._on_cpu = self.device.type == "cpu"
-        initialise()
-        self._k = cost_kernels(REAL[self.dtype])
-        load(self._k.module, self.device)
+        self._k = _ready(self.dtype, self.device)
         self._parts = parts_struct(scene.parts, self.dtype, self.device)
         self._wobble = wobble_struct(smoothing, self.dtype, self.device)
         self._world = make_world(self._k, scene, acts, self.dtype, self.device)
