@@ -444,6 +444,15 @@ def test_eight_processes_that_fill_one_cache_at_once_get_the_same(cache, meshes,
     print("\ncache: 4 rounds of 8 processes, same result in all 32, no warning, nothing left behind")
 
 
+@pytest.mark.parametrize("answer", ["", "PK", "hello"])
+def test_an_answer_that_cannot_be_read_means_the_hull_for_now(cache, monkeypatch, answer):
+    folder = cache("cache")
+    monkeypatch.setattr(module, "_child_command", [sys.executable, "-c", f"print({answer!r}, end='')"])
+    with pytest.warns(UserWarning, match="answer cannot be read"):
+        assert decompose(l_shape()).report.method == "hull"
+    assert files(folder) == []
+
+
 @pytest.mark.parametrize(
     ("child", "message"),
     [
