@@ -177,8 +177,11 @@ def _ask_child(vertices, faces, *, deadline: float, stop: threading.Event, **set
         starved = any(word in message for word in (b"MemoryError", b"bad_alloc"))
         kind = _KilledError if starved or child.returncode in _OUTSIDE else BackendError
         raise kind(" ".join([f"CoACD's process ended with code {child.returncode}", *tail]))
-    with np.load(io.BytesIO(found)) as data:
-        return np.split(data["vertices"], np.cumsum(data["counts"])[:-1])
+    try:
+        with np.load(io.BytesIO(found)) as data:
+            return np.split(data["vertices"], np.cumsum(data["counts"])[:-1])
+    except Exception as error:  # of any kind, see _load
+        raise BackendError(f"CoACD's answer cannot be read ({error})") from error
 
 
 def _cut(
