@@ -141,10 +141,13 @@ class Growth(_Bench):
     """Objects in an image; 8 parts each, 4 images."""
     images: tuple[int, ...] = (1, 4, 16, 64)
     """Images; 6 objects of 8 parts in each."""
+    fixed: tuple[int, int, int] = (8, 6, 4)
+    """Parts, objects and images where it is another of them that grows. A crowd: ``--parts --images --fixed 1 1 1 --objects
+    100 1000 5000``."""
 
     def run(self, results: dict[str, Any], device: torch.device) -> None:
         for backend in self._own_backends() if self.backend else backends()[:1]:
-            base = GrowthCase(backend=backend, device=str(device), threads=self.threads, seed=self.seed)
+            base = GrowthCase(*self.fixed, backend=backend, device=str(device), threads=self.threads, seed=self.seed)
             run_growth(results, base, self.parts, self.objects, self.images)
 
 
@@ -264,8 +267,8 @@ def run_scenes(results, device, counts, configs, data, seed, **options) -> None:
 
 def run_growth(results, base: GrowthCase, parts, objects, images) -> None:
     """Sizes of generated scenes, one process each."""
-    if min([*parts, *objects, *images, 1]) < 1:
-        raise InvalidInputError("--parts, --objects, --images: expected positive numbers")
+    if min([*parts, *objects, *images, base.parts, base.objects, base.images]) < 1:
+        raise InvalidInputError("--parts, --objects, --images, --fixed: expected positive numbers")
     what = "torch's allocator on the device" if base.device.startswith("cuda") else "resident set above a tiny scene's"
     print(f"\nGrowth: generated scenes, backend {base.backend}; peak memory: {what}, a process for each row")
     rows = bench_growth(sweep(base, sorted(parts), sorted(objects), sorted(images)), on_row=_progress)
