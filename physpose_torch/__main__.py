@@ -31,6 +31,11 @@ def _run(argv: Sequence[str] | None) -> int:
     except BrokenPipeError:  # the reader, head say, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except OSError as error:  # of a folder that may not be looked into, say
+        if error.filename is None:
+            raise
+        print(f"physpose: error: {error.filename}: {error.strerror}; check the path, and who may use it", file=sys.stderr)
+        return 2
 
 
 if __name__ == "__main__":

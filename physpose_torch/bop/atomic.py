@@ -7,7 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-__all__ = ["replacing"]
+from physpose_torch.errors import DataError
+
+__all__ = ["replacing", "write_text", "written"]
 
 
 @contextlib.contextmanager
@@ -32,3 +34,27 @@ def replacing(path: Path, *, temporary: Path | None = None) -> Iterator[BinaryIO
     finally:
         with contextlib.suppress(FileNotFoundError):
             temporary.unlink()
+
+
+@contextlib.contextmanager
+def written(path: Path) -> Iterator[None]:
+    """Tell that a file cannot be written as a :class:`DataError` that names it."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(f"{path}: cannot be written ({error.strerror or error}); check the folder and its free space") from None
+
+
+def write_text(path: str | os.PathLike, text: str) -> None:
+    """Write a text file as a whole or not at all; of a link, the file it points to. A pipe or a device gets it as it comes.
+
+    Raises:
+        DataError: it cannot be written.
+    """
+    with written(Path(path)):
+        path = Path(path).resolve()
+        if path.exists() and not path.is_file():
+            path.write_text(text)
+            return
+        with replacing(path) as file:
+            file.write(text.encode())

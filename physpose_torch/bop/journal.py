@@ -12,6 +12,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from physpose_torch.bop.atomic import written
 from physpose_torch.errors import DataError
 
 try:
@@ -186,15 +187,6 @@ class Journal:
                 with contextlib.suppress(OSError):
                     self._file.truncate(self._end)
                 raise
-
-
-@contextlib.contextmanager
-def written(path: Path) -> Iterator[None]:
-    """Tell that a file cannot be written as a :class:`DataError` that names it."""
-    try:
-        yield
-    except OSError as error:
-        raise DataError(f"{path}: cannot be written ({error.strerror or error}); check the folder and its free space") from None
 
 
 def _locked(path: Path) -> BinaryIO:

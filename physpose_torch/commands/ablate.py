@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from physpose_torch.ablation import Variant, as_estimated, choose, list_variants
 from physpose_torch.bop.ablation import Ablation, Batch, Disturbance, Outcome, prepare, restricted
+from physpose_torch.bop.atomic import write_text
 from physpose_torch.bop.dataset import BopDataset
 from physpose_torch.bop.formats import Estimates
 from physpose_torch.bop.harm import NOTABLE
@@ -112,9 +113,11 @@ class Ablate(ImageOptions):
         if self.json is not None:
             content = self._options(estimates, part, len(looked_at), count) | content
             content |= {"skipped": skipped, "problems": problems}
-            self.json.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+            write_text(self.json, json.dumps(content, indent=2, allow_nan=False) + "\n")
         if not self.quiet:
             print("", *self._notes(part, len(looked_at), count, skipped), sep="\n")
+        elif not failures:
+            problems += [f"{row.variant.name}: {row.error}" for row in rows if row.error]
         for problem in problems:
             logger.error(problem)
         return 1 if problems or failed else 0

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import tyro
 
-from physpose_torch.commands.common import progress, table
+from physpose_torch.bop.atomic import write_text
+from physpose_torch.commands.common import check_output, progress, table
 from physpose_torch.errors import DataError
 from physpose_torch.geometry.body import load_mesh
 from physpose_torch.geometry.decompose import DecomposeOptions, decompose_many
@@ -38,6 +39,7 @@ class Decompose:
     """No progress bar and no table."""
 
     def __call__(self) -> int:
+        check_output(self.json)
         if not self.folder.is_dir():
             raise DataError(f"{self.folder} is not a folder")
         paths = sorted(p for p in self.folder.iterdir() if p.suffix.lower() in MESHES)
@@ -59,7 +61,7 @@ class Decompose:
                 bar.update()
         if self.json is not None:
             content = {"meshes": {k: reports[k]._asdict() for k in sorted(reports)}, "failures": failures}
-            self.json.write_text(json.dumps(content, indent=2) + "\n")
+            write_text(self.json, json.dumps(content, indent=2) + "\n")
         if not self.quiet:
             mm = [
                 [name, r.method, str(r.n_parts), *(1e3 * x for x in r[2:6]), r.seconds]

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from physpose_torch.bop.atomic import write_text
 from physpose_torch.bop.formats import Estimates
 from physpose_torch.bop.scenes import ImageScene, poses_of
 from physpose_torch.commands.common import check_output, progress
@@ -61,7 +62,7 @@ class Report(ImageOptions):
                 bar.update(len(batch))
         if self.json is not None:
             content = {"images": measured, "rows": rows, "problems": problems}
-            self.json.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+            write_text(self.json, json.dumps(content, indent=2, allow_nan=False) + "\n")
         if not self.quiet:
             print(describe(rows, measured, statics=self.planes is not None or self.statics is not None))
         for problem in problems:

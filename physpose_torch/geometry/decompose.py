@@ -13,6 +13,7 @@ import threading
 import time
 import warnings
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
@@ -34,6 +35,7 @@ __all__ = ["DecomposeOptions", "DecomposeReport", "Decomposition", "decompose", 
 logger = logging.getLogger("physpose_torch")
 
 ALGORITHM_VERSION = 3  # part of the cache key: raise it whenever results change
+_LARGEST = 100_000_000  # bytes that a cache file may unpack to
 FINENESS = (3.0, 2.0)  # CoACD's concavity thresholds to try, in tolerances
 _warned: set[bytes] = set()  # meshes whose fallback has been reported
 _LIMITS = {
@@ -237,14 +239,31 @@ def _cache_path(mesh: trimesh.Trimesh, options: DecomposeOptions) -> Path:
 
 def _load(path: Path) -> Decomposition | None:
     try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > _LARGEST:
+                raise ValueError("too large")
         with np.load(path, allow_pickle=False) as data:
-            hulls = np.split(data["vertices"], np.cumsum(data["counts"])[:-1])
-            return Decomposition(hulls, DecomposeReport(**json.loads(str(data["report"]))))
+            vertices, counts = data["vertices"], data["counts"]
+            report = DecomposeReport(**json.loads(str(data["report"])))
+        _check(vertices, counts, report)
+        return Decomposition(np.split(vertices, np.cumsum(counts)[:-1]), report)
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         logger.warning("cache file %s is unreadable (%s): computed anew", path, error)
         return None
+
+
+def _check(vertices: np.ndarray, counts: np.ndarray, report: DecomposeReport) -> None:
+    """ValueError unless these are hulls, and their report."""
+    if vertices.dtype != np.float64 or vertices.shape[1:] != (3,) or not (np.abs(vertices) < 1e3).all():
+        raise ValueError(f"vertices {vertices.dtype} {vertices.shape}")
+    if counts.ndim != 1 or counts.dtype.kind not in "iu" or not (counts > 3).all() or counts.sum() != len(vertices):
+        raise ValueError(f"{counts} vertices of parts")
+    if report.method not in ("convex", "coacd", "hull") or report.n_parts != len(counts) or report.warning is not None:
+        raise ValueError("another report")
+    if not all(isinstance(x, float) and 0 <= x < np.inf for x in report[2:7]):
+        raise ValueError("errors that are no lengths")
 
 
 def _store(path: Path, result: Decomposition) -> None:
