@@ -32,9 +32,8 @@ def _run(argv: Sequence[str] | None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:  # of a folder that may not be looked into, say
-        if error.filename is None:
-            raise
-        print(f"physpose: error: {error.filename}: {error.strerror}; check the path, and who may use it", file=sys.stderr)
+        where = "" if error.filename is None else f"{error.filename}: "
+        print(f"physpose: error: {where}{error.strerror or error}; check the path, and who may use it", file=sys.stderr)
         return 2
 
 

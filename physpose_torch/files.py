@@ -120,6 +120,7 @@ def inside(folder: Path, name: str) -> Path:
     """
     try:
         path, folder = (folder / name).resolve(), folder.resolve()
+        path.is_file()  # raises if it is too long
     except (OSError, RuntimeError, ValueError) as error:  # too long; a loop of links; a null byte
         raise ValueError(f"{shown(name)} is no path ({_reason(error)}); correct it") from None
     if not path.is_relative_to(folder):

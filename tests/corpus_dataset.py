@@ -9,13 +9,15 @@ from bop_files import HEADER, OFFSET_MM, UP, K, csv_row, standing, write_depth, 
 from PIL import Image
 
 from physpose_torch.__main__ import main
+from physpose_torch.errors import MissingExtraError
+from physpose_torch.table.estimator import TableEstimator
 
 WIDTH, HEIGHT = 80, 64
 IMAGES = range(10)
 
 
 def write_everything(root):
-    """The files by what they are; `estimates`, `planes`, ... are options of the commands, the others are found."""
+    """Into a folder; the names of files are those of options, where there is one."""
     truth = {im: [(1, standing(-80, 4 * im, 50)), (4, standing(60, 30, 15))] for im in IMAGES}
     write_models(root / "models")
     scene = write_scene(root / "test", 2, {im: [(o, T, 1.0) for o, T in rows] for im, rows in truth.items()})
@@ -58,20 +60,29 @@ def write_everything(root):
     }
     for path, content in contents.items():
         path.write_text(json.dumps(content))
-    return {
-        "estimates": root / "estimates.csv",
-        **{path.stem: path for path in contents},
-        "scene_gt": scene / "scene_gt.json",
-        "scene_gt_info": scene / "scene_gt_info.json",
-        "models_info": root / "models" / "models_info.json",
+
+
+def files_of(root):
+    """What can be broken, by its name."""
+    scene = root / "test" / "000002"
+    found = {path.stem: path for path in [*root.glob("*.*"), *scene.glob("*.json"), *root.glob("models/*.json")]}
+    return found | {
         "mesh": root / "models" / "obj_000001.ply",
         "rgb": scene / "rgb" / "000000.png",
         "depth": scene / "depth" / "000000.png",
-        "second": root / "second.png",
         "models": root / "models",
         "split": root / "test",
         "folder": scene,
     }
+
+
+def without_export(monkeypatch):
+    """Let matches be by SIFT alone: XFeat's export takes ten seconds."""
+
+    def missing(*_):
+        raise MissingExtraError("not in this test")
+
+    monkeypatch.setattr(TableEstimator, "_xfeat", missing)
 
 
 def commands(root):

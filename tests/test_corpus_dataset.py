@@ -6,10 +6,7 @@ import collections
 
 import pytest
 from corpus import mutated, mutated_json
-from corpus_dataset import run, write_everything
-
-from physpose_torch.errors import MissingExtraError
-from physpose_torch.table.estimator import TableEstimator
+from corpus_dataset import files_of, run, without_export, write_everything
 
 FEW = pytest.param(4, id="few")
 MANY = pytest.param(400, id="many", marks=pytest.mark.slow)
@@ -31,17 +28,13 @@ READ_BY = {
 @pytest.fixture(scope="module")
 def everything(tmp_path_factory):
     root = tmp_path_factory.mktemp("data")
-    return root, write_everything(root)
+    write_everything(root)
+    return root, files_of(root)
 
 
 @pytest.fixture(autouse=True)
 def no_export(monkeypatch):
-    """XFeat's takes ten seconds."""
-
-    def missing(*_):
-        raise MissingExtraError("not in this test")
-
-    monkeypatch.setattr(TableEstimator, "_xfeat", missing)
+    without_export(monkeypatch)
 
 
 @pytest.mark.parametrize("name", sorted({name for names in READ_BY.values() for name in names}))

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from physpose_torch.ablation import Knowledge, Variant, disturb, with_exact_planes, without_planes
+from physpose_torch.bop.atomic import write_text
 from physpose_torch.bop.dataset import BopDataset
 from physpose_torch.bop.formats import Estimates
 from physpose_torch.bop.harm import RESAMPLES, Matches, match_acting, mssd_of
@@ -107,7 +108,7 @@ def restricted(dataset: BopDataset, images: Collection[tuple[int, int]]) -> BopD
     targets = [t._asdict() for t in dataset.targets if t[:2] in images]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "targets.json"
-        path.write_text(json.dumps(targets))
+        write_text(path, json.dumps(targets))
         part = BopDataset(dataset.path, split=dataset.split_path.name, models=dataset.models_path, targets=path)
         _ = part.targets  # read while the file is there
     return part
