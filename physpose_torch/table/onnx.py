@@ -144,8 +144,9 @@ class _Model:
         return self._shaped(outputs, "scores", len(like)).float() if "scores" in outputs else ones
 
     def _kept(self, scores: Tensor, *columns: Tensor) -> Tensor:
-        """Which rows are good enough, and have no NaN or infinity in any of the columns (K, D)."""
-        return (scores >= self.record.threshold) & torch.cat(columns, 1).isfinite().all(1)
+        """Which rows are good enough, and have no NaN or infinity, nor have the columns (K, D) beside them."""
+        finite = torch.cat([scores[:, None], *columns], 1).isfinite().all(1)
+        return (scores >= self.record.threshold) & finite
 
 
 class _Extractor(_Model):
