@@ -5,6 +5,7 @@ The slow variant prints how many were tried, and what came of them: ``pytest -m 
 
 import collections
 import json
+import os
 import re
 import warnings
 
@@ -15,12 +16,14 @@ import trimesh
 from bop_files import HEADER, OFFSET_MM, UP, csv_row, standing, write_models, write_scene
 from corpus import mutated
 
+from physpose_torch import files as files_module
 from physpose_torch.__main__ import main
 from physpose_torch.errors import PhysPoseError
 from physpose_torch.geometry.body import Body
 from physpose_torch.geometry.resting import resting_poses
 from physpose_torch.robot.arm import LOOK_ALONG, demo_arm
 from physpose_torch.robot.environment import RobotEnvironment
+from physpose_torch.robot.shapes import find_mesh
 
 FEW = pytest.param(25, id="few")
 MANY = pytest.param(1500, id="many", marks=pytest.mark.slow)
@@ -220,6 +223,36 @@ def test_robots_are_refused_or_finite(tmp_path, count, capsys):
     with capsys.disabled():
         if count > 100:
             print(f"\nurdf: {count} broken files: {dict(outcomes)}")
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize(
+    "name", ["x" * 5000, "../" * 900 + "x", "pipe", "loop", "folder", "file:///dev/zero", "package://a", "\ud800"]
+)
+def test_meshes_of_a_robot_that_are_no_files_are_named(tmp_path, name):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "loop").symlink_to("loop")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(PhysPoseError, match="arm: no mesh"):
+        find_mesh(name, tmp_path / "arm.urdf", where="arm")
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("kind", ["pipe", "loop", "device", "folder", "deep", "entities"])
+def test_robots_that_are_no_files_are_refused_at_once(tmp_path, kind, monkeypatch):
+    monkeypatch.setattr(files_module, "PATIENCE", 0.05)
+    path = tmp_path / "arm.urdf"
+    make = {
+        "pipe": lambda: os.mkfifo(path),
+        "loop": lambda: path.symlink_to(path.name),
+        "device": lambda: path.symlink_to("/dev/zero"),
+        "folder": path.mkdir,
+        "deep": lambda: path.write_text("<a>" * 200_000 + "</a>" * 200_000),
+        "entities": lambda: path.write_text('<!DOCTYPE a [<!ENTITY b "bb">]><robot name="&b;"/>'),
+    }
+    make[kind]()
+    with pytest.raises(PhysPoseError, match=r"arm\.urdf"):
+        RobotEnvironment.from_urdf(path, camera_link="camera")
 
 
 def test_a_mesh_is_told_what_is_wrong_with_it():

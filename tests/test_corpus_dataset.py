@@ -48,6 +48,7 @@ def test_the_files_are_good_before_they_are_broken(everything, name, capsys):
 def test_broken_json_is_refused_listed_or_read(everything, broken, name, count, capsys, caplog):
     root, files = everything
     whole, outcomes = files[broken].read_bytes(), collections.Counter()
+    count = max(count // 8, 2) if "table" in name else count  # a second each
     try:
         for seed in range(count):
             files[broken].write_bytes(mutated(whole, seed) if seed % 4 == 3 else mutated_json(whole, seed))
@@ -60,6 +61,6 @@ def test_broken_json_is_refused_listed_or_read(everything, broken, name, count, 
     finally:
         files[broken].write_bytes(whole)
     with capsys.disabled():
-        if count > 100:
+        if count > 10:
             names = {0: "read", 1: "listed", 2: "refused"}
             print(f"\n{broken}, {name}: {count} broken files:", *(f"{names[c]} {n}," for c, n in sorted(outcomes.items())))
