@@ -162,6 +162,7 @@ PICTURES = {
 }
 
 
+@pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")
 @pytest.mark.parametrize("kind", PICTURES)
 def test_broken_pictures_are_refused(data, kind, capsys):
     root, files = data
@@ -177,14 +178,10 @@ def test_broken_pictures_are_refused(data, kind, capsys):
     assert run(root, "eval") == 2
 
 
-@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr", "LAB", "HSV", "I", "F", "I;16"])
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA", "CMYK", "YCbCr", "LAB", "I", "F", "I;16"])
 def test_pictures_of_every_mode_are_colours_or_refused(tmp_path, mode):
-    path = tmp_path / ("x.tif" if mode not in ("PA", "HSV") else "x.png")
-    picture = Image.new("RGB", (WIDTH, HEIGHT), (200, 100, 50))
-    with contextlib.suppress(OSError, ValueError):  # what Pillow cannot write is not tested
-        (Image.new(mode, picture.size) if mode in ("I;16", "F", "I") else picture.convert(mode)).save(path)
-    if not path.exists() or not path.stat().st_size:
-        pytest.skip("cannot be written")
+    path = tmp_path / "x.tif"
+    Image.new(mode, (WIDTH, HEIGHT)).save(path)
     if mode in ("I", "F", "I;16"):
         with pytest.raises(DataError, match=r"x\.tif: has 16 bits or more a pixel"):
             read_image(path)
