@@ -16,7 +16,7 @@ import trimesh
 from bop_files import HEADER, OFFSET_MM, UP, csv_row, standing, write_models, write_scene
 from corpus import mutated
 
-from physpose_torch import files as files_module
+from physpose_torch import reading
 from physpose_torch.__main__ import main
 from physpose_torch.errors import PhysPoseError
 from physpose_torch.geometry.body import Body
@@ -240,7 +240,7 @@ def test_meshes_of_a_robot_that_are_no_files_are_named(tmp_path, name):
 @pytest.mark.timeout(20)
 @pytest.mark.parametrize("kind", ["pipe", "loop", "device", "folder", "deep", "entities"])
 def test_robots_that_are_no_files_are_refused_at_once(tmp_path, kind, monkeypatch):
-    monkeypatch.setattr(files_module, "PATIENCE", 0.05)
+    monkeypatch.setattr(reading, "PATIENCE", 0.05)
     path = tmp_path / "arm.urdf"
     make = {
         "pipe": lambda: os.mkfifo(path),

@@ -19,7 +19,7 @@ from corpus import nested
 from corpus_dataset import HEIGHT, WIDTH, files_of, png, run, without_export, write_everything
 from PIL import Image
 
-from physpose_torch import files as module
+from physpose_torch import reading as module
 from physpose_torch.bop.dataset import BopDataset
 from physpose_torch.bop.formats import read_statics
 from physpose_torch.bop.table import read_image, read_pairs

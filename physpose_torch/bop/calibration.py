@@ -9,7 +9,7 @@ from typing import Any
 from physpose_torch.bop.atomic import write_text
 from physpose_torch.config import Calibration
 from physpose_torch.errors import DataError, InvalidInputError
-from physpose_torch.files import load_json, shown
+from physpose_torch.reading import load_json, shown
 
 __all__ = ["read_calibration", "write_calibration"]
 

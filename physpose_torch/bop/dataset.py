@@ -18,8 +18,8 @@ import torch
 
 from physpose_torch.bop.formats import MAX_ID, Target, load_json, read_targets
 from physpose_torch.errors import DataError, InvalidInputError, UnknownLabelError
-from physpose_torch.files import LONGEST_SIDE, MOST_PIXELS, read_pixels, read_size
 from physpose_torch.geometry.body import FARTHEST, read_mesh
+from physpose_torch.reading import LONGEST_SIDE, MOST_PIXELS, read_pixels, read_size
 
 __all__ = ["MESH_SCALE", "BopDataset", "Camera", "GroundTruth", "symmetry_transforms"]
 

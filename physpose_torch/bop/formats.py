@@ -18,7 +18,7 @@ import torch
 
 from physpose_torch.bop.atomic import replacing
 from physpose_torch.errors import DataError, InvalidInputError
-from physpose_torch.files import inside, load_json, read_text, shown
+from physpose_torch.reading import inside, load_json, read_text, shown
 
 __all__ = [
     "Estimates",

@@ -12,7 +12,7 @@ import numpy as np
 
 from physpose_torch.bop.formats import Estimates, make_estimates, no_result_file, parse_rows, refuse_metres
 from physpose_torch.errors import DataError
-from physpose_torch.files import opened
+from physpose_torch.reading import opened
 
 __all__ = ["EstimatesIndex"]
 

@@ -16,8 +16,8 @@ from physpose_torch.bop.atomic import write_text
 from physpose_torch.bop.dataset import BopDataset
 from physpose_torch.bop.formats import MAX_ID, Estimates, load_json
 from physpose_torch.errors import DataError, PhysPoseError, UnknownLabelError
-from physpose_torch.files import inside, read_pixels, shown
 from physpose_torch.geometry.body import Body, Plane
+from physpose_torch.reading import inside, read_pixels, shown
 from physpose_torch.scene import Scene
 from physpose_torch.table.estimator import TableEstimate, TableEstimator
 from physpose_torch.table.view import View

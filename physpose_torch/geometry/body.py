@@ -13,9 +13,9 @@ from trimesh.resolvers import FilePathResolver
 
 from physpose_torch import se3
 from physpose_torch.errors import DataError, InvalidInputError
-from physpose_torch.files import inside
 from physpose_torch.geometry.convex import ConvexParts
 from physpose_torch.geometry.decompose import DecomposeOptions, DecomposeReport, decompose
+from physpose_torch.reading import inside
 
 __all__ = ["FARTHEST", "Body", "Plane", "is_flat", "load_mesh", "read_mesh"]
 

@@ -11,9 +11,9 @@ import numpy as np
 import trimesh
 
 from physpose_torch.errors import DataError, InvalidInputError
-from physpose_torch.files import shown
 from physpose_torch.geometry.body import Body, load_mesh
 from physpose_torch.geometry.convex import ConvexParts
+from physpose_torch.reading import shown
 from physpose_torch.robot.urdf import Collision, RobotModel
 
 __all__ = ["Meshes", "find_mesh", "link_body"]

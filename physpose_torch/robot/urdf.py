@@ -17,7 +17,7 @@ from torch import Tensor
 
 from physpose_torch import se3
 from physpose_torch.errors import DataError
-from physpose_torch.files import opened
+from physpose_torch.reading import opened
 
 __all__ = ["Collision", "Joint", "Mimic", "RobotModel", "read_urdf"]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from physpose_torch.errors import DataError
-from physpose_torch.files import inside, load_json, shown
+from physpose_torch.reading import inside, load_json, shown
 
 __all__ = ["ROLES", "ModelRecord", "read_manifest"]
 
