@@ -1,20 +1,37 @@
 """The ``physpose`` command."""
 
+import contextlib
 import logging
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
 
 __all__ = ["main"]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns its exit code: 0 only if all went well."""
+    """Run one command; returns its exit code: 0 only if all went well, 130 if it was stopped by Ctrl-C or SIGTERM."""
     try:
-        return _run(argv)
+        with _terminated_as_interrupted():
+            return _run(argv)
     except KeyboardInterrupt as interrupt:
         print("; ".join(["physpose: interrupted", *map(str, interrupt.args)]), file=sys.stderr)
         return 130
+
+
+@contextlib.contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """SIGTERM ends the block as Ctrl-C does, unless somebody else handles it, or may."""
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _run(argv: Sequence[str] | None) -> int:

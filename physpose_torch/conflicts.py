@@ -91,8 +91,8 @@ def find_overlaps(poses: Tensor, scene: Scene, acts: Tensor, backend: str) -> tu
     if chosen_backend(backend) == "warp":
         from physpose_torch import fused  # which imports Warp
 
-        if fused.remembers(scene):
-            pairs, depth = fused.FusedMeasure(scene, acts, poses).overlaps()
+        if fused.remembers(scene, poses, 0.0):
+            pairs, depth = fused.FusedMeasure(scene, acts, poses, 0.0).overlaps()
             pairs = pairs.cpu()
             both = _both_act(pairs, acts, n)
             return pairs[both], depth[both.to(depth.device)]

@@ -74,7 +74,7 @@ def find_contacts(
     acts = _all_act(scene, acts)
     T = scene.entity_poses(poses)
     entity = scene.instance_entity
-    entity_pairs = _felt(scene.entity_pairs, acts, n)
+    entity_pairs = _felt(scene.near_pairs(T, margin), acts, n)
     pairs = meeting_pairs(_bounds(T, scene), entity, scene.instance_start, entity_pairs, margin=margin)
     first, second = entity[pairs[:, 0]], entity[pairs[:, 1]]
     moves_first, moves_second = _moves(first, second, acts, n)
@@ -145,7 +145,8 @@ def find_drops(
     # only what may stop an object before its plane does is looked at
     to_plane = _least(above.detach(), who_plane.to(device), n)[0].minimum(reach).cpu()
     falls = (scene.gravity != 0).any(-1)
-    both_ways = torch.cat([scene.entity_pairs, scene.entity_pairs.flip(1)])
+    both_ways = scene.near_pairs(T, float(to_plane.max()) if n else 0.0)
+    both_ways = torch.cat([both_ways, both_ways.flip(1)])
     both_ways = both_ways[both_ways[:, 0] < n]
     carries = torch.ones(len(scene.entity_image), dtype=torch.bool)
     carries[:n] = acts
@@ -199,7 +200,8 @@ def find_static_gaps(
     n, device = len(scene), poses.device
     T = scene.entity_poses(poses)
     entity, start = scene.instance_entity, scene.instance_start
-    static_pairs = scene.entity_pairs[scene.entity_pairs[:, 1] >= n]
+    static_pairs = scene.near_pairs(T, FAR)
+    static_pairs = static_pairs[static_pairs[:, 1] >= n]
     falls = (scene.gravity != 0).any(-1)
     static_pairs = static_pairs[falls[scene.image[static_pairs[:, 0]]]]
     gravity = scene.gravity.to(poses)
@@ -296,7 +298,7 @@ def _bounds(T: Tensor, scene: Scene):
     entity = scene.instance_entity
     with torch.no_grad():
         bounds = instance_bounds(
-            T.detach()[entity.to(T.device)],
+            scene.seen_from_first(T.detach())[entity.to(T.device)],
             scene.parts,
             scene.instance_part.to(T.device),
             scene.gravity.to(T)[scene.entity_image[entity].to(T.device)],

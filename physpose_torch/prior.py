@@ -11,9 +11,12 @@ from physpose_torch.scene import Scene
 
 __all__ = ["PosePrior", "common_depth", "make_prior", "pose_covariance"]
 
-
 REWEIGHTINGS = 8
 """Steps of reweighted least squares for the common depth factor."""
+
+
+LEAST_RATIO, MOST_RATIO = 1e-3, 1e5
+"""Of σ along the ray to that across it, what a matrix can hold and be inverted: by default from 0.2 mm to 20 km away."""
 
 
 class PosePrior(NamedTuple):
@@ -95,7 +98,8 @@ def pose_covariance(measured: Tensor, center: Tensor, config: PhysicsConfig) -> 
         config: its sigma fields.
 
     Returns:
-        (..., N, 6, 6): translation in the camera frame [m²], rotation (isotropic) in the object frame [rad²].
+        (..., N, 6, 6): translation in the camera frame [m²], rotation (isotropic) in the object frame [rad²]. σ along the ray
+        is 1e-3 to 1e5 times that across it, which is what a matrix in float64 can hold.
     """
     ray = (measured[..., :3, :3] @ center.to(measured)[..., None])[..., 0] + measured[..., :3, 3]
     distance = torch.linalg.vector_norm(ray, dim=-1)[..., None, None]
@@ -103,8 +107,10 @@ def pose_covariance(measured: Tensor, center: Tensor, config: PhysicsConfig) -> 
     along = direction[..., :, None] * direction[..., None, :]
     eye = torch.eye(3, dtype=measured.dtype, device=measured.device)
     variance = config.sigma_ray**2 + (config.sigma_ray_fraction * distance) ** 2
+    lateral = config.sigma_lateral**2
+    variance = variance.clamp(lateral * LEAST_RATIO**2, lateral * MOST_RATIO**2)
     covariance = torch.zeros(*measured.shape[:-2], 6, 6, dtype=measured.dtype, device=measured.device)
-    covariance[..., :3, :3] = config.sigma_lateral**2 * (eye - along) + variance * along
+    covariance[..., :3, :3] = lateral * (eye - along) + variance * along
     covariance[..., 3:, 3:] = config.sigma_rotation**2 * eye
     return covariance
 

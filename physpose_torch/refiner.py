@@ -29,7 +29,7 @@ LEFT = "poses are left as they were estimated"
 WORST = 1e6
 """What an object that was left as it was costs a hypothesis; no cost of poses is as high."""
 FARTHEST = 100.0
-"""[m]; estimates beyond this are in millimetres."""
+"""[m]; estimates beyond this, and farther away than a hundred times their body's size, are in millimetres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,8 @@ class Refinement:
 
         From the curvature of the cost at rest, contacts included: across a contact a pose is better known than along it.
         Where an estimate was left as it was, it is the estimate's own; zero for objects that were not to be refined. Worked
-        out on first use, 12 evaluations of the cost for each object of the largest image.
+        out on first use, 12 evaluations of the cost for each object of the largest image and a matrix of 6 N × 6 N for it: of
+        thousands of objects in one image it is not to be had. In float32 variances below eps of the largest are lost.
         """
         shape, flat = self.poses.shape[:-2], self.poses.shape[:-2].numel()
         with torch.inference_mode(False), torch.no_grad():
@@ -105,11 +106,14 @@ class Refinement:
 
 
 def _check_metres(poses: Tensor, scene: Scene) -> None:
-    distance = torch.linalg.vector_norm(poses.detach()[..., :3, 3], dim=-1)
-    if bool((distance > FARTHEST).any()):
-        row = int((distance > FARTHEST).nonzero()[0, -1])
+    distance = torch.linalg.vector_norm(poses.detach()[..., :3, 3].double(), dim=-1)
+    if not bool((distance > FARTHEST).any()):
+        return
+    far = distance > (FARTHEST * 2 * scene.entity_span[: len(scene)].to(distance)).clamp_min(FARTHEST)
+    if bool(far.any()):
+        *_, row = first = far.nonzero()[0].tolist()
         raise InvalidInputError(
-            f"poses[..., {row}] ({scene.labels[row]}) is {float(distance.max()):.4g} m from the camera; "
+            f"poses[..., {row}] ({scene.labels[row]}) is {float(distance[tuple(first)]):.4g} m from the camera; "
             "translations are in metres, divide millimetres by 1000"
         )
 
@@ -164,7 +168,8 @@ class PhysPoseRefiner(nn.Module):
             callback: called before each step with step, flat poses and terms of the images still running.
 
         Raises:
-            InvalidInputError: shapes, NaN or non-rigid poses, a covariance that is not positive definite.
+            InvalidInputError: shapes, NaN or non-rigid poses, a covariance that is not positive definite; or an object is more
+                than 100 m and more than a hundred times its size away from the camera, as in millimetres.
         """
         poses = as_matrix(poses)
         check_poses(poses, scene)

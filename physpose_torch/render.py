@@ -56,7 +56,7 @@ def render(
 
     Both sides of a face are drawn. Where two faces have the same depth (to float32), the one with the lower index
     wins. Not differentiable; `(vertices[faces[face_id]] * barycentric[..., None]).sum(-2)` is, with respect to
-    `vertices`. Geometry is computed in float64 whatever the input.
+    `vertices`. Geometry is computed in float64 whatever the input; depths are exact to 16 eps of the farthest vertex's.
 
     Args:
         vertices: (V, 3) in the camera frame, z forward [m].

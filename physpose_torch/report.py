@@ -142,6 +142,9 @@ def physics_report(
 ) -> PhysicsReport:
     """Measure poses without changing them.
 
+    All is computed in float64, with the errors of :func:`~physpose_torch.distance.autograd.signed_distance` and, in relation to
+    planes, of :func:`~physpose_torch.distance.plane.plane_distance`.
+
     Args:
         poses: T_camera_object, (..., N, 4, 4) [m].
         scene: the N objects, statics and gravity.
@@ -201,8 +204,8 @@ def measure(
     """
     if hasattr(cost, "measure"):
         return cost.measure(reach=REACH)
-    if chosen_backend(backend) == "warp" and _fused().remembers(scene):
-        return _fused().FusedMeasure(scene, acts, poses).measure(reach=REACH)
+    if chosen_backend(backend) == "warp" and _fused().remembers(scene, poses, REACH):
+        return _fused().FusedMeasure(scene, acts, poses, REACH).measure(reach=REACH)
     contacts = find_contacts(poses, scene, acts=acts, backend=backend)
     depth = (-contacts.distance).clamp_min(0.0)
     first, second = contacts.pair_first[contacts.pair], contacts.pair_second[contacts.pair]

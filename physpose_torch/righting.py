@@ -98,10 +98,11 @@ def _leans(poses: Tensor, scene: Scene, acts: Tensor, falls: Tensor, backend: st
         return leans
     holds = torch.ones(len(scene.entity_image), dtype=torch.bool)
     holds[:n] = acts
-    pairs = torch.cat([scene.entity_pairs, scene.entity_pairs.flip(1)])
+    T, entity = scene.entity_poses(poses), scene.instance_entity
+    pairs = scene.near_pairs(T, TOLERANCE)
+    pairs = torch.cat([pairs, pairs.flip(1)])
     pairs = pairs[pairs[:, 0] < n]
     pairs = pairs[falls.cpu()[pairs[:, 0]] & holds[pairs[:, 1]]]
-    T, entity = scene.entity_poses(poses), scene.instance_entity
     down = scene.gravity.to(poses)[scene.entity_image.to(device)]
     bounds = instance_bounds(T[entity.to(device)], scene.parts, scene.instance_part.to(device), down[entity.to(device)])
     bounds = type(bounds)(*(x.cpu() for x in bounds))

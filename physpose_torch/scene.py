@@ -10,11 +10,15 @@ import torch
 from torch import Tensor
 
 from physpose_torch import se3
+from physpose_torch.distance.broadphase import near_spheres
 from physpose_torch.errors import InvalidInputError
 from physpose_torch.geometry.body import Body, Plane
 from physpose_torch.geometry.convex import ConvexParts
 
 __all__ = ["Scene", "Static", "as_matrix"]
+
+CROWD = 100
+"""More objects and static bodies than this in one image are not all held against each other."""
 
 
 def as_matrix(T: Any, *, single: bool = False) -> Any:
@@ -315,17 +319,47 @@ class Scene:
     @cached_property
     def entity_pairs(self) -> Tensor:
         """(E, 2) pairs of entities that may meet: of one image, at least one movable, not alternatives of one object."""
-        n = len(self)
         order = torch.argsort(self.entity_image, stable=True)
         end = torch.bincount(self.entity_image, minlength=self.n_images).cumsum(0)[self.entity_image[order]]
         later = torch.arange(1, len(order) + 1)
         first, second = _ranges(later, end - later)  # each with all that come after it in its image
-        pairs = torch.stack([order[first], order[second]], dim=1)
+        return self._may_meet(torch.stack([order[first], order[second]], dim=1))
+
+    def near_pairs(self, T: Tensor, margin: float) -> Tensor:
+        """Those of :attr:`entity_pairs`, in that order, that come within ``margin`` [m] of each other at poses T (N + S, 4, 4).
+
+        All of them where no image holds more than ``CROWD``: it is not worth asking then. By spheres around their origins.
+        """
+        if not self.crowded:
+            return self.entity_pairs
+        center, found = T.detach()[:, :3, 3].double().cpu(), []
+        order = torch.argsort(self.entity_image, stable=True)
+        for rows in order.split(torch.bincount(self.entity_image, minlength=self.n_images).tolist()):
+            if len(rows) > 1:
+                found.append(rows[near_spheres(center[rows], self.entity_span[rows], margin)])
+        return self._may_meet(torch.cat(found))
+
+    @cached_property
+    def crowded(self) -> bool:
+        """Whether any image holds more than ``CROWD`` objects and static bodies."""
+        return bool((torch.bincount(self.entity_image) > CROWD).any())
+
+    def _may_meet(self, pairs: Tensor) -> Tensor:
+        """Pairs (E, 2) of entities of one image without those of statics, or of alternatives of one object."""
+        n = len(self)
         movable = pairs[:, 0] < n
         same = torch.full((len(self.entity_image),), -1)
         same[:n] = self.same_object
         different = (same[pairs[:, 0]] != same[pairs[:, 1]]) | (pairs[:, 1] >= n)
         return pairs[movable & different]
+
+    def seen_from_first(self, T: Tensor) -> Tensor:
+        """Poses T (N + S, 4, 4) moved so that the first of each image is in the origin: nothing is lost far from the camera."""
+        entity = torch.arange(len(self.entity_image))
+        first = torch.full((self.n_images,), len(entity)).scatter_reduce(0, self.entity_image, entity, "amin")
+        out = T.clone()
+        out[:, :3, 3] -= T[first[self.entity_image].to(T.device), :3, 3]
+        return out
 
     @cached_property
     def plane_pairs(self) -> Tensor:

@@ -166,12 +166,12 @@ def _on_planes(posed: Posed, dropped: Tensor, gravity: Tensor, wanted: Tensor, t
 def _on_bodies(posed: Posed, dropped: Tensor, gravity: Tensor, wanted: Tensor, tolerance: float) -> _Contacts:
     """Where edges of the objects' parts are near parts of other bodies below, and the other way round."""
     scene, device, n = posed.scene, dropped.device, len(posed.scene)
-    pairs = scene.entity_pairs
-    pairs = torch.cat([pairs, pairs.flip(1)])
     carries = torch.ones(len(scene.entity_image), dtype=torch.bool)
     carries[:n] = posed.acts
     reach = torch.zeros(len(scene.entity_image), dtype=torch.float64)
     reach[:n] = posed.gap.cpu() + tolerance
+    pairs = scene.near_pairs(posed.T, float(torch.where(reach.isfinite(), reach, 0.0).max()))
+    pairs = torch.cat([pairs, pairs.flip(1)])
     pairs = pairs[(pairs[:, 0] < n) & carries[pairs[:, 1]]]
     pairs = pairs[wanted.cpu()[pairs[:, 0]]]
     pairs = pairs[reach[pairs[:, 0]].isfinite()]  # with gravity, and something below

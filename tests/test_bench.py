@@ -260,6 +260,14 @@ def test_growth_rows_tell_size_time_memory_and_exponent(monkeypatch):
     assert len(growth_table(rows).splitlines()) == 5
 
 
+def test_what_does_not_grow_stays_as_it_is_fixed(monkeypatch):
+    seen = []
+    monkeypatch.setattr("physpose_torch.bench.__main__.bench_growth", lambda cases, **_: seen.extend(cases) or [])
+    assert main(["growth", "--parts", "--images", "--objects", "1", "1000", "--fixed", "1", "2", "3"]) == 0
+    assert [(c.parts, c.objects, c.images, c.varied) for c in seen] == [(1, 1, 3, "objects"), (1, 1000, 3, "objects")]
+    assert main(["growth", "--fixed", "1", "0", "3"]) == 2
+
+
 @pytest.mark.slow
 def test_a_process_of_its_own_measures_the_same_scene():
     case = GrowthCase(parts=1, objects=2, images=1, backend=BACKEND)

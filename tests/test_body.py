@@ -92,8 +92,34 @@ def test_symmetries_are_kept_and_checked():
 
 
 def test_a_mesh_that_must_be_in_millimetres_is_refused_with_the_remedy():
-    with pytest.raises(InvalidInputError, match=r"box is 100 m large.*scale=0\.001"):
+    with pytest.raises(InvalidInputError, match=r"box is 100 m large.*scale=0\.001.*scale=1\.0"):
         Body.from_mesh(trimesh.creation.box((100.0, 60.0, 40.0)), label="box", cache=False)
+
+
+@pytest.mark.parametrize(("size", "scale"), [(1e-3, None), (1.0, 1e-3), (100.0, 1.0), (1e5, 1e-3)])
+def test_meshes_of_a_millimetre_to_a_hundred_metres_become_bodies(size, scale):
+    extents = torch.tensor([1.0, 0.6, 0.4], dtype=torch.float64) * size * (scale or 1.0)
+    mesh = trimesh.creation.box([size, 0.6 * size, 0.4 * size])
+    body = Body.from_mesh(mesh, label="box", scale=scale, cache=False)
+    assert body.parts.n_parts == 1
+    torch.testing.assert_close(body.parts.upper[0], 0.5 * extents, atol=2e-9, rtol=1e-6)
+    torch.testing.assert_close(body.upper, 0.5 * extents)
+
+
+@pytest.mark.parametrize("options", [{}, {"tolerance": 0.2}])
+def test_a_large_mesh_is_cut_as_finely_as_a_small_one_and_says_how_well(options):
+    """An L of 60 m, to 0.4 % of that or to what is given, in metres."""
+    outline = np.array([[0, 0], [60, 0], [60, 20], [20, 20], [20, 60], [0, 60]])
+    flat = [[0, 1, 2], [0, 2, 3], [0, 3, 5], [3, 4, 5]]
+    faces = [[a, c, b] for a, b, c in flat] + [[a + 6, b + 6, c + 6] for a, b, c in flat]
+    for i in range(6):
+        k = (i + 1) % 6
+        faces += [[i, k, k + 6], [i, k + 6, i + 6]]
+    mesh = trimesh.Trimesh(np.concatenate([np.c_[outline, np.full(6, z)] for z in (0, 20)]), faces)
+    body = Body.from_mesh(mesh, label="L", scale=1.0, cache=False, **options)
+    assert body.parts.n_parts == 2
+    assert body.decomposition.outward_p95 < options.get("tolerance", 0.24)
+    assert float(body.parts.upper[:, 0].max()) == pytest.approx(60.0, abs=0.3)
 
 
 @pytest.mark.parametrize(

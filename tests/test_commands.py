@@ -186,8 +186,8 @@ def test_batches_are_of_usable_images_and_of_what_stands_between_them():
 
 def test_the_images_of_a_batch_are_made_after_the_one_before_is_refined(dataset, monkeypatch):
     """So memory does not grow with the file."""
+    from physpose_torch.commands import batches as module
     from physpose_torch.commands import images as opening
-    from physpose_torch.commands import refine as module
 
     events, refine_batch, scenes = [], module._refine, opening.image_scenes
 

@@ -17,6 +17,7 @@ import pytest
 from bop_files import HEADER, OFFSET_MM, UP, csv_row, standing, write_models, write_scene
 
 from physpose_torch.__main__ import main
+from physpose_torch.commands import batches as refining
 from physpose_torch.commands import refine as module
 
 IMAGES = 24
@@ -69,11 +70,6 @@ def undisturbed(dataset):
     return result(dataset, "undisturbed.csv")
 
 
-@pytest.fixture
-def few_at_a_time(monkeypatch):
-    monkeypatch.setattr(module, "AT_A_TIME", 3)
-
-
 def left_over(root):
     """Files that no finished run leaves behind."""
     return sorted(p.name for p in root.iterdir() if p.name.endswith((".journal", ".tmp")))
@@ -123,22 +119,21 @@ def kill_and_resume(root, kills, rng):
         found.append(records(root))
 
 
-def test_parts_of_any_size_give_the_same_result(dataset, undisturbed, monkeypatch):
-    for size, batch in ((1, 1), (3, 2), (7, 16)):
-        monkeypatch.setattr(module, "AT_A_TIME", size)
+def test_batches_of_any_size_give_the_same_result(dataset, undisturbed):
+    for batch in (1, 3, 16):
         assert refine(dataset, "--batch", batch) == 1
         assert result(dataset) == undisturbed
     assert left_over(dataset) == []
 
 
-def test_the_order_of_the_rows_does_not_change_what_an_image_gets(dataset, undisturbed, few_at_a_time):
+def test_the_order_of_the_rows_does_not_change_what_an_image_gets(dataset, undisturbed):
     header, *rows = (dataset / "est.csv").read_text().split("\n")
     (dataset / "est.csv").write_text("\n".join([header, *sorted(rows)]))
     assert refine(dataset) == 1
     assert sorted(line.strip() for line in result(dataset)[0]) == sorted(line.strip() for line in undisturbed[0])
 
 
-def test_bad_rows_of_all_parts_are_listed_in_file_order(dataset, undisturbed, few_at_a_time):
+def test_bad_rows_of_all_parts_are_listed_in_file_order(dataset, undisturbed):
     """Images with some usable row by the first of these, then those without any, then rows of no image."""
     assert refine(dataset) == 1
     problems = result(dataset)[1]["problems"]
@@ -155,7 +150,7 @@ def test_bad_rows_of_all_parts_are_listed_in_file_order(dataset, undisturbed, fe
         assert (a == b) == (len(fields) != 7 or fields[1] == "im_id" or int(fields[1]) in named)
 
 
-def test_killed_at_random_moments_and_resumed_the_result_is_the_same(dataset, undisturbed, few_at_a_time):
+def test_killed_at_random_moments_and_resumed_the_result_is_the_same(dataset, undisturbed):
     found = kill_and_resume(dataset, 12, random.Random(1))
     assert result(dataset) == undisturbed
     assert left_over(dataset) == []
@@ -163,7 +158,7 @@ def test_killed_at_random_moments_and_resumed_the_result_is_the_same(dataset, un
 
 
 @pytest.mark.slow
-def test_a_hundred_kills_change_nothing(dataset, undisturbed, few_at_a_time):
+def test_a_hundred_kills_change_nothing(dataset, undisturbed):
     rng = random.Random(2)
     kills = 0
     while kills < 100:
@@ -211,7 +206,7 @@ def test_interrupted_while_the_result_is_written_nothing_is_refined_again(datase
     assert "27 of 27 images are done" in capsys.readouterr().err
     assert (dataset / "out.csv").read_text() == "what was there before"
     assert left_over(dataset) == ["out.csv.journal"]
-    monkeypatch.setattr(module, "_refine", None)
+    monkeypatch.setattr(refining, "_refine", None)
     assert refine(dataset, "--resume") == 1
     assert result(dataset) == undisturbed
 
@@ -236,7 +231,7 @@ def test_interrupted_before_anything_is_done_nothing_is_left(dataset, monkeypatc
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(module, "_refine", interrupt)
+    monkeypatch.setattr(refining, "_refine", interrupt)
     assert refine(dataset, "--scenes", "2", "--every", "30") == 130
     assert capsys.readouterr().err == "physpose: interrupted\n"
     assert left_over(dataset) == []
@@ -246,14 +241,14 @@ def test_interrupted_before_anything_is_done_nothing_is_left(dataset, monkeypatc
 def stop_after(batches, monkeypatch):
     """Make the next run stop after so many batches."""
     count = itertools.count()
-    refine_batch = module._refine
+    refine_batch = refining._refine
 
     def stopping(*args):
         if next(count) == batches:
             raise KeyboardInterrupt
         return refine_batch(*args)
 
-    monkeypatch.setattr(module, "_refine", stopping)
+    monkeypatch.setattr(refining, "_refine", stopping)
 
 
 @pytest.mark.parametrize(
@@ -293,23 +288,22 @@ def test_batch_json_and_quiet_may_change_on_resume(dataset, undisturbed, monkeyp
 @pytest.mark.parametrize("stop", [1, 2, 4, 5])
 def test_a_resumed_run_refines_the_batches_that_an_undisturbed_one_does(dataset, monkeypatch, stop):
     """Sums round differently in other batches."""
-    monkeypatch.setattr(module, "AT_A_TIME", 7)
-    refine_batch, batches = module._refine, []
+    refine_batch, noted = refining._refine, []
 
     def noting(images, *args):
-        batches.append([i.im_id for i in images])
+        noted.append([i.im_id for i in images])
         return refine_batch(images, *args)
 
-    monkeypatch.setattr(module, "_refine", noting)
+    monkeypatch.setattr(refining, "_refine", noting)
     assert refine(dataset, "--batch", "3") == 1
-    undisturbed = list(batches)
-    assert {len(b) for b in batches} == {1, 2, 3}
-    batches.clear()
+    undisturbed = list(noted)
+    assert {len(b) for b in noted} == {2, 3}
+    noted.clear()
     with monkeypatch.context() as patch:
         stop_after(stop, patch)
         assert refine(dataset, "--batch", "3") == 130
     assert refine(dataset, "--batch", "3", "--resume") == 1
-    assert batches == undisturbed
+    assert noted == undisturbed
 
 
 def test_resume_without_an_earlier_run_begins(dataset, undisturbed):
@@ -339,15 +333,15 @@ def test_the_summary_can_go_to_a_pipe(dataset, undisturbed):
     assert content["problems"] == undisturbed[1]["problems"]
 
 
-def test_a_second_run_with_the_same_out_is_refused(dataset, undisturbed, few_at_a_time, monkeypatch, capsys):
-    refine_batch, codes = module._refine, []
+def test_a_second_run_with_the_same_out_is_refused(dataset, undisturbed, monkeypatch, capsys):
+    refine_batch, codes = refining._refine, []
 
     def second(*args):
-        monkeypatch.setattr(module, "_refine", refine_batch)
+        monkeypatch.setattr(refining, "_refine", refine_batch)
         codes.extend([refine(dataset), refine(dataset, "--resume")])
         return refine_batch(*args)
 
-    monkeypatch.setattr(module, "_refine", second)
+    monkeypatch.setattr(refining, "_refine", second)
     assert refine(dataset) == 1
     assert codes == [2, 2]
     assert capsys.readouterr().err.count("another physpose refine is writing there") == 2
@@ -371,7 +365,7 @@ def test_onto_itself(dataset, undisturbed):
 
 
 @pytest.mark.parametrize("content", ["\ufeff{0}\r\n{1}\r\n{2}\r\n", "{1}\r{2}", "{0}\n\n{1}\n\n{2}"])
-def test_byte_order_marks_line_ends_and_headers_are_kept(dataset, few_at_a_time, content):
+def test_byte_order_marks_line_ends_and_headers_are_kept(dataset, content):
     rows = [csv_row(2, im, 1, 0.9, standing(0, 0, 45)) for im in (1, 2)]
     (dataset / "est.csv").write_bytes(content.format(HEADER, *rows).encode())
     assert refine(dataset) == 0

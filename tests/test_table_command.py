@@ -231,16 +231,13 @@ def test_pairs_of_images_refine_without_planes(files, dataset, tmp_path):
     assert np.abs(height).mean() < 0.6 * np.abs((before - true) @ files.pair.normal.numpy()).mean()
 
 
-def test_a_second_image_is_used_wherever_its_rows_are(files, dataset, tmp_path, monkeypatch):
+def test_a_second_image_is_used_wherever_its_rows_are(files, dataset, tmp_path):
     """Though the images are read one at a time."""
-    from physpose_torch.commands import refine
-
     more = ("--table", "auto", "--pairs", str(dataset / "pairs.json"), "--config.steps", "2")
     poses = []
-    for size in (256, 1):
-        monkeypatch.setattr(refine, "AT_A_TIME", size)
+    for size in ("256", "1"):
         out = tmp_path / f"out{size}.csv"
-        assert run_refine(files, dataset, out, "--batch", "1", *more)[0] == 0
+        assert run_refine(files, dataset, out, "--batch", size, *more)[0] == 0
         poses.append([line.split(",")[:6] for line in out.read_text().splitlines()])
     assert poses[0] == poses[1]
 

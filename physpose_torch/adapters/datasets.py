@@ -58,7 +58,7 @@ def bodies_from_rigid_objects(
             raise InvalidInputError(f"two objects are called {label!r}; labels must differ")
         scale = _scale(thing, label)
         transforms = _symmetries(thing, label, scale, max_symmetry_step) if symmetries else None
-        body = Body.from_mesh(path, label=label, scale=scale, symmetries=transforms, **coacd_options)
+        body = Body.from_mesh(path, label=label, scale=_believed(scale), symmetries=transforms, **coacd_options)
         if transforms is not None:
             _check_symmetries(body)
         found[label] = body
@@ -98,6 +98,7 @@ def bodies_from_folder(
     if not meshes:
         raise DataError(f"{folder}: no mesh in it; expected <label>/*.ply, <label>/*.obj, <label>.ply or <label>.obj")
     wanted = sorted(label for label in meshes if labels is None or label in labels)
+    scale = _believed(scale)
     return {label: Body.from_mesh(meshes[label], label=label, scale=scale, **coacd_options) for label in wanted}
 
 
@@ -118,6 +119,11 @@ def _attribute(thing: Any, name: str, number: int) -> Any:
             f"objects[{number}] is a {type(thing).__name__} without {name!r}; expected a RigidObject"
         )
     return getattr(thing, name)
+
+
+def _believed(scale: float) -> float | None:
+    """Metres are what happypose takes meshes to be in if nobody says; so a mesh of a hundred of them is in millimetres."""
+    return None if scale == 1.0 else scale
 
 
 def _scale(thing: Any, label: str) -> float:

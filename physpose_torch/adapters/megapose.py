@@ -21,6 +21,7 @@ from torch import Tensor
 from physpose_torch import se3
 from physpose_torch.bop.formats import load_json
 from physpose_torch.errors import DataError, InvalidInputError
+from physpose_torch.files import write_file, written
 
 __all__ = ["CameraData", "ObjectData", "read_camera_data", "read_object_data", "write_object_data"]
 
@@ -94,8 +95,9 @@ def write_object_data(path: str | Path, data: ObjectData) -> None:
         if data.poses is not None:
             T = data.poses[i].double().cpu().numpy()
             entry["TWO"] = [Rotation.from_matrix(T[:3, :3]).as_quat().tolist(), T[:3, 3].tolist()]
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    Path(path).write_text(json.dumps(entries), encoding="utf-8")
+    with written(path):
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+    write_file(path, json.dumps(entries))
 
 
 def read_camera_data(path: str | Path) -> CameraData:

@@ -16,6 +16,7 @@ from typing import Annotated, Any, Union
 import torch
 import tyro
 
+from physpose_torch.bench.engines import EngineOptions, run_engines
 from physpose_torch.bench.grasp import GraspOptions, run_grasps
 from physpose_torch.bench.growth import GrowthCase, bench_growth, growth_table, sweep
 from physpose_torch.bench.images import load_images
@@ -31,6 +32,7 @@ from physpose_torch.bench.tables import TableOptions, run_tables
 from physpose_torch.bench.training import TrainingOptions, run_training
 from physpose_torch.distance.autograd import backends
 from physpose_torch.errors import InvalidInputError, PhysPoseError
+from physpose_torch.files import write_file
 
 __all__ = ["main"]
 
@@ -79,7 +81,7 @@ class _Bench(ABC):
             for note in results["notes"]:
                 print(f"note: {note}")
             if self.json is not None:
-                self.json.write_text(json.dumps(_plain(results), indent=2, allow_nan=False) + "\n")
+                write_file(self.json, json.dumps(_plain(results), indent=2, allow_nan=False) + "\n")
         if self.plot is not None:
             plot_costs(self.plot, results)
         return 0
@@ -139,10 +141,13 @@ class Growth(_Bench):
     """Objects in an image; 8 parts each, 4 images."""
     images: tuple[int, ...] = (1, 4, 16, 64)
     """Images; 6 objects of 8 parts in each."""
+    fixed: tuple[int, int, int] = (8, 6, 4)
+    """Parts, objects and images where it is another of them that grows. A crowd: ``--parts --images --fixed 1 1 1 --objects
+    100 1000 5000``."""
 
     def run(self, results: dict[str, Any], device: torch.device) -> None:
         for backend in self._own_backends() if self.backend else backends()[:1]:
-            base = GrowthCase(backend=backend, device=str(device), threads=self.threads, seed=self.seed)
+            base = GrowthCase(*self.fixed, backend=backend, device=str(device), threads=self.threads, seed=self.seed)
             run_growth(results, base, self.parts, self.objects, self.images)
 
 
@@ -187,6 +192,16 @@ class Stress(StressOptions, _Bench):
 
 
 @dataclass(frozen=True)
+class Engines(EngineOptions, _Bench):
+    """The engines of physpose refine: images a second, and whether the poses are those of one process."""
+
+    def run(self, results: dict[str, Any], device: torch.device) -> None:
+        if self.plot is not None or self.data is not None or self.backend or device.type != "cpu":
+            raise InvalidInputError("engines: runs on a result file on the CPU; no --plot, --data, --backend, --device")
+        run_engines(results, self)
+
+
+@dataclass(frozen=True)
 class All(_Bench):
     """Pairs, scenes and growth with modest sizes: what runs without a subcommand."""
 
@@ -211,6 +226,7 @@ COMMANDS = {
     "grasp": Grasp,
     "training": Training,
     "stress": Stress,
+    "engines": Engines,
 }
 
 
@@ -251,8 +267,8 @@ def run_scenes(results, device, counts, configs, data, seed, **options) -> None:
 
 def run_growth(results, base: GrowthCase, parts, objects, images) -> None:
     """Sizes of generated scenes, one process each."""
-    if min([*parts, *objects, *images, 1]) < 1:
-        raise InvalidInputError("--parts, --objects, --images: expected positive numbers")
+    if min([*parts, *objects, *images, base.parts, base.objects, base.images]) < 1:
+        raise InvalidInputError("--parts, --objects, --images, --fixed: expected positive numbers")
     what = "torch's allocator on the device" if base.device.startswith("cuda") else "resident set above a tiny scene's"
     print(f"\nGrowth: generated scenes, backend {base.backend}; peak memory: {what}, a process for each row")
     rows = bench_growth(sweep(base, sorted(parts), sorted(objects), sorted(images)), on_row=_progress)

@@ -173,7 +173,7 @@ def _near_pairs(scene: Scene, poses: torch.Tensor) -> int:
     entity = scene.instance_entity
     gravity = scene.gravity[scene.entity_image[entity]]
     bounds = instance_bounds(poses[entity], scene.parts, scene.instance_part, gravity)
-    return len(meeting_pairs(bounds, entity, scene.instance_start, scene.entity_pairs))
+    return len(meeting_pairs(bounds, entity, scene.instance_start, scene.near_pairs(poses, 0.0)))
 
 
 def _exponent(before: dict[str, Any] | None, row: dict[str, Any]) -> float | None:

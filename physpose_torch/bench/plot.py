@@ -1,10 +1,12 @@
 """Cost against size, as a picture."""
 
+import io
 from pathlib import Path
 from typing import Any
 
 from physpose_torch.bench.loops import LOOPS
 from physpose_torch.errors import InvalidInputError, MissingExtraError
+from physpose_torch.files import write_file
 
 __all__ = ["plot_costs"]
 
@@ -21,6 +23,7 @@ def plot_costs(path: Path, results: dict[str, Any]) -> None:
 
     Raises:
         InvalidInputError: nothing in the results has a size, or matplotlib cannot write this kind of file.
+        DataError: the file cannot be written.
         MissingExtraError: matplotlib is not installed.
     """
     panels = [
@@ -53,10 +56,12 @@ def plot_costs(path: Path, results: dict[str, Any]) -> None:
     figure.supxlabel(
         f"{where}, {threads} torch thread{'s' if threads != 1 else ''}", fontsize=8, color="0.4", x=0.99, ha="right"
     )
+    picture = io.BytesIO()
     try:
-        figure.savefig(path)
+        figure.savefig(picture, format=path.suffix[1:])
     except ValueError as error:
         raise InvalidInputError(f"{path}: {error}") from error
+    write_file(path, picture.getvalue())
 
 
 def _batches(axes, results) -> None:

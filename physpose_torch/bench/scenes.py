@@ -29,7 +29,7 @@ from physpose_torch.refiner import PhysPoseRefiner, silent_doubts
 
 __all__ = ["bench_scenes", "make_config", "scenes_table", "seconds_per_iteration"]
 
-SLOW = ("fcl",)
+SLOW = ("fcl", "fcl-isolated")
 """Backends that work pair by pair in Python, about a second an image."""
 SLOW_LIMIT = 16
 """More images than this are left out for them unless asked for."""

@@ -1,12 +1,9 @@
 """Variants of the refiner and baselines on the images of a BOP result file: poses, recalls, physics and time of each."""
 
-import json
-import tempfile
 import time
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +11,6 @@ import torch
 from torch import Tensor
 
 from physpose_torch.ablation import Knowledge, Variant, disturb, with_exact_planes, without_planes
-from physpose_torch.bop.atomic import write_text
 from physpose_torch.bop.dataset import BopDataset
 from physpose_torch.bop.formats import Estimates
 from physpose_torch.bop.harm import RESAMPLES, Matches, match_acting, mssd_of
@@ -105,12 +101,9 @@ def prepare(images: list[ImageScene], estimates: Estimates, disturbance: Disturb
 
 def restricted(dataset: BopDataset, images: Collection[tuple[int, int]]) -> BopDataset:
     """The same dataset, with the targets of these images, (scene_id, im_id), only."""
-    targets = [t._asdict() for t in dataset.targets if t[:2] in images]
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "targets.json"
-        write_text(path, json.dumps(targets))
-        part = BopDataset(dataset.path, split=dataset.split_path.name, models=dataset.models_path, targets=path)
-        _ = part.targets  # read while the file is there
+    options = {"models": dataset.models_path, "targets": dataset.targets_path}
+    part = BopDataset(dataset.path, split=dataset.split_path.name, **options)
+    part.targets = [t for t in dataset.targets if t[:2] in images]
     return part
 
 

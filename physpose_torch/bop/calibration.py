@@ -6,9 +6,9 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-from physpose_torch.bop.atomic import write_text
 from physpose_torch.config import Calibration
 from physpose_torch.errors import DataError, InvalidInputError
+from physpose_torch.files import write_file
 from physpose_torch.reading import load_json, shown
 
 __all__ = ["read_calibration", "write_calibration"]
@@ -24,14 +24,14 @@ _FIELDS = {
 
 
 def write_calibration(path: str | os.PathLike, calibration: Calibration, **more: Any) -> None:
-    """Write a calibration, and what else there is to say about it, as JSON."""
+    """Write a calibration, and what else there is to say about it, as JSON; DataError if that cannot be done."""
     content = {name: getattr(calibration, field) / unit for name, (field, unit) in _FIELDS.items()}
     interval = {
         name: [x / unit for x in calibration.interval[field]]
         for name, (field, unit) in _FIELDS.items()
         if field in calibration.interval
     }
-    write_text(path, json.dumps({**content, "interval": interval, **more}, indent=2) + "\n")
+    write_file(path, json.dumps({**content, "interval": interval, **more}, indent=2) + "\n")
 
 
 def read_calibration(path: str | os.PathLike) -> Calibration:

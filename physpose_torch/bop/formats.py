@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from physpose_torch.bop.atomic import replacing
 from physpose_torch.errors import DataError, InvalidInputError
+from physpose_torch.files import write_file
 from physpose_torch.reading import inside, load_json, read_text, shown
 
 __all__ = [
@@ -281,6 +281,7 @@ def write_estimates(path: str | os.PathLike, estimates: Estimates, poses: Any, *
     Raises:
         InvalidInputError: Wrong shapes, poses that are not finite or not rigid or in another unit, times that differ
             within an image, or a folder that does not exist.
+        DataError: The file cannot be written; what was there before is kept.
     """
     path = Path(path)
     lines, place = list(estimates.text), estimates.place.tolist()
@@ -288,8 +289,7 @@ def write_estimates(path: str | os.PathLike, estimates: Estimates, poses: Any, *
         lines[place[row]] = text
     if not path.parent.is_dir():
         raise InvalidInputError(f"{path}: the folder {path.parent} does not exist; create it first")
-    with replacing(path) as file:
-        file.write("".join(lines).encode())
+    write_file(path, "".join(lines))
 
 
 def rewrite_rows(estimates: Estimates, poses: Any, *, time: Any = None) -> list[tuple[int, str]]:

@@ -6,7 +6,7 @@ import re
 from array import array
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -26,8 +26,8 @@ _NOBODY = -1  # whose lines without scene and image are
 class EstimatesIndex:
     """An index of a BOP result CSV. Rows of one image may be anywhere in the file.
 
-    The file is read once from one end to the other, and kept open. Memory is 16 bytes a line and 24 an image, several times
-    that while the index is made; never the rows themselves.
+    The file is read once from one end to the other, and kept open; an index that was pickled opens it anew. Memory is 16 bytes
+    a line and 24 an image, several times that while the index is made; never the rows themselves.
 
     Args:
         path: the CSV; what :func:`~physpose_torch.bop.formats.read_estimates` accepts. A pipe is copied to disk first.
@@ -76,10 +76,15 @@ class EstimatesIndex:
         chosen = np.isin(self.keys[:, 0], scenes) if scenes else np.ones(len(self.keys), dtype=bool)
         return np.flatnonzero(chosen)[::every]
 
+    def names(self, images: np.ndarray) -> list[tuple[int, int]]:
+        """(scene_id, im_id) of the images with these numbers."""
+        return [(scene, image) for scene, image in self.keys[images].tolist()]
+
     def numbers(self, keys: Iterable[tuple[int, int]]) -> np.ndarray:
-        """Numbers of the images of these (scene_id, im_id); those that the file does not name are left out."""
+        """Numbers of the images of these (scene_id, im_id), ascending; those that the file does not name are left out."""
         wanted = np.array([s * _IDS + i for s, i in keys], dtype=np.int64)
-        return np.flatnonzero(np.isin(self.keys[:, 0] * _IDS + self.keys[:, 1], wanted))
+        every = self.keys[:, 0] * _IDS + self.keys[:, 1]
+        return np.flatnonzero(np.isin(every, wanted)) if len(wanted) else wanted
 
     def read(self, images: np.ndarray) -> Estimates:
         """All rows of the images with these numbers, in file order.
@@ -87,6 +92,8 @@ class EstimatesIndex:
         Raises:
             DataError: the file was changed since the index was made.
         """
+        if self._file is None:
+            self._file = _opened(self._real)
         spans = [self._order[self._start[i] : self._start[i + 1]] for i in np.unique(images)]
         lines = np.sort(np.concatenate([np.zeros(0, dtype=np.int64), *spans]))
         text = []
@@ -96,6 +103,12 @@ class EstimatesIndex:
         self._check()
         rows, problems, _ = parse_rows(self.path, zip((lines + 1).tolist(), text, strict=True), started=True)
         return make_estimates(self.path, rows, problems, text, lines + 1)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the open file: another process opens it when it first reads."""
+        if not self.path.is_file():
+            raise DataError(f"{self.path}: is a pipe, which other processes cannot read; save it to a file")
+        return self.__dict__ | {"_file": None, "_real": self.path.resolve()}
 
     def __iter__(self) -> Iterator[bytes]:
         """All lines of the file, line ends included.

@@ -12,15 +12,15 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from physpose_torch.bop.atomic import written
 from physpose_torch.errors import DataError
+from physpose_torch.files import written
 
 try:
     import fcntl
 except ImportError:  # Windows: two runs with one --out are not kept apart
     fcntl = None
 
-__all__ = ["Journal", "written"]
+__all__ = ["Journal"]
 
 logger = logging.getLogger("physpose_torch")
 _KIND = "journal of physpose refine"

@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from physpose_torch import se3
-from physpose_torch.bop.atomic import write_text
 from physpose_torch.bop.dataset import BopDataset
 from physpose_torch.bop.formats import MAX_ID, Estimates, load_json
 from physpose_torch.errors import DataError, PhysPoseError, UnknownLabelError
+from physpose_torch.files import write_file
 from physpose_torch.geometry.body import Body, Plane
 from physpose_torch.reading import inside, read_pixels, shown
 from physpose_torch.scene import Scene
@@ -142,8 +142,8 @@ def table_entry(estimate: TableEstimate) -> dict[str, Any]:
 
 
 def write_table(path: str | Path, estimate: TableEstimate) -> None:
-    """Write a table as JSON, an entry that planes files accept."""
-    write_text(path, json.dumps(table_entry(estimate), indent=2) + "\n")
+    """Write a table as JSON, an entry that planes files accept; DataError if that cannot be done."""
+    write_file(path, json.dumps(table_entry(estimate), indent=2) + "\n")
 
 
 def read_pairs(path: str | Path) -> dict[tuple[int, int], Pair]:

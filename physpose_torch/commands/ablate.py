@@ -14,7 +14,6 @@ from tqdm import tqdm
 
 from physpose_torch.ablation import Variant, as_estimated, choose, list_variants
 from physpose_torch.bop.ablation import Ablation, Batch, Disturbance, Outcome, prepare, restricted
-from physpose_torch.bop.atomic import write_text
 from physpose_torch.bop.dataset import BopDataset
 from physpose_torch.bop.formats import Estimates
 from physpose_torch.bop.harm import NOTABLE
@@ -25,6 +24,7 @@ from physpose_torch.commands.common import check_output, progress
 from physpose_torch.commands.images import ImageOptions, in_batches
 from physpose_torch.config import Calibration, RefinerConfig
 from physpose_torch.errors import InvalidInputError, PhysPoseError
+from physpose_torch.files import write_file
 from physpose_torch.losses import acting
 from physpose_torch.planted import Failure, FailureName, choose_failures
 
@@ -113,7 +113,7 @@ class Ablate(ImageOptions):
         if self.json is not None:
             content = self._options(estimates, part, len(looked_at), count) | content
             content |= {"skipped": skipped, "problems": problems}
-            write_text(self.json, json.dumps(content, indent=2, allow_nan=False) + "\n")
+            write_file(self.json, json.dumps(content, indent=2, allow_nan=False) + "\n")
         if not self.quiet:
             print("", *self._notes(part, len(looked_at), count, skipped), sep="\n")
         elif not failures:

@@ -1,5 +1,6 @@
 """What the commands share: progress bars and the tables they print."""
 
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,20 @@ def check_output(*paths: Path | None) -> None:
     """Refuse to start long work whose results could not be written.
 
     Raises:
-        DataError: a file's folder does not exist, or the path is a folder.
+        DataError: a file's folder does not exist, or the path is a folder, or one of them is read-only.
     """
     for path in paths:
-        if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
-            what = "is a folder" if path.is_dir() else "lies in no existing folder"
-            raise DataError(f"{path} {what}; name a file to write")
+        if path is None:
+            continue
+        folder = path.absolute().parent
+        faults = {
+            "is a folder": path.is_dir(),
+            "lies in no existing folder": not folder.is_dir(),
+            "is read-only": path.exists() and not os.access(path, os.W_OK),
+            "lies in a read-only folder": not path.exists() and not os.access(folder, os.W_OK),
+        }
+        if told := [what for what, true in faults.items() if true]:
+            raise DataError(f"{path} {told[0]}; name a file to write")
 
 
 def progress(total: int | None, what: str, unit: str, *, quiet: bool = False, **options: Any) -> tqdm:

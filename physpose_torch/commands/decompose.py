@@ -1,5 +1,6 @@
 """``physpose decompose``: fill the cache of convex parts for a folder of meshes."""
 
+import contextlib
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -7,9 +8,9 @@ from typing import Annotated
 
 import tyro
 
-from physpose_torch.bop.atomic import write_text
 from physpose_torch.commands.common import check_output, progress, table
 from physpose_torch.errors import DataError
+from physpose_torch.files import write_file
 from physpose_torch.geometry.body import load_mesh
 from physpose_torch.geometry.decompose import DecomposeOptions, decompose_many
 
@@ -51,8 +52,12 @@ class Decompose:
 
         meshes = {p.name: loader(p) for p in paths}
         reports, failures = {}, {}
-        with progress(len(meshes), "decompose", "mesh", quiet=self.quiet) as bar:
-            for name, result in decompose_many(meshes, self.options, workers=self.workers):
+        # closing: on Ctrl-C it is over only when no child process is left
+        with (
+            progress(len(meshes), "decompose", "mesh", quiet=self.quiet) as bar,
+            contextlib.closing(decompose_many(meshes, self.options, workers=self.workers)) as results,
+        ):
+            for name, result in results:
                 if isinstance(result, Exception):
                     failures[name] = str(result)
                 else:
@@ -61,7 +66,7 @@ class Decompose:
                 bar.update()
         if self.json is not None:
             content = {"meshes": {k: reports[k]._asdict() for k in sorted(reports)}, "failures": failures}
-            write_text(self.json, json.dumps(content, indent=2) + "\n")
+            write_file(self.json, json.dumps(content, indent=2) + "\n")
         if not self.quiet:
             mm = [
                 [name, r.method, str(r.n_parts), *(1e3 * x for x in r[2:6]), r.seconds]

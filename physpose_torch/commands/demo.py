@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from physpose_torch.commands.common import progress, table
+from physpose_torch.commands.common import check_output, progress, table
 from physpose_torch.config import RefinerConfig
 
 __all__ = ["Demo"]
@@ -31,6 +31,7 @@ class Demo:
         from physpose_torch.demo import run_demo
         from physpose_torch.household import household_meshes
 
+        check_output(self.out)
         with progress(len(household_meshes()), "decompose", "mesh", quiet=self.quiet) as bar:
             demo = run_demo(seed=self.seed, config=self.config, on_body=lambda name: bar.update())
         if not self.quiet:

@@ -10,13 +10,13 @@ import torch
 import tyro
 
 from physpose_torch import se3
-from physpose_torch.bop.atomic import write_text
 from physpose_torch.bop.dataset import BopDataset
 from physpose_torch.bop.formats import Estimates, PlaneRecord, read_estimates, read_planes
 from physpose_torch.bop.metrics import Recall, Scores, evaluate
 from physpose_torch.bop.residuals import Distribution, distribution, errors_against_gt
 from physpose_torch.bop.vsd import VsdDepth
 from physpose_torch.commands.common import check_output, progress, table
+from physpose_torch.files import write_file
 
 __all__ = ["Eval"]
 
@@ -73,7 +73,7 @@ class Eval:
         if self.planes is not None:
             content["inside_table"] = inside_table(estimates, dataset, planes, self.scenes)
         if self.json is not None:
-            write_text(self.json, json.dumps(content, indent=2) + "\n")
+            write_file(self.json, json.dumps(content, indent=2) + "\n")
         if not self.quiet:
             print(score_table(scores), *([note] if note else []), sep="\n\n")
             print("", errors_text(errors, counts), sep="\n")

@@ -4,34 +4,27 @@ import dataclasses
 import hashlib
 import json
 import logging
-import time
-from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-import torch
 
 from physpose_torch import __version__
-from physpose_torch.bop.atomic import replacing
-from physpose_torch.bop.formats import Estimates, rewrite_rows
 from physpose_torch.bop.index import EstimatesIndex
-from physpose_torch.bop.journal import Journal, written
-from physpose_torch.bop.scenes import ImageScene, poses_of
+from physpose_torch.bop.journal import Journal
+from physpose_torch.commands.batches import BatchRefiner
 from physpose_torch.commands.common import check_output, describe, progress
-from physpose_torch.commands.images import ImageOptions, Known, in_batches, together
-from physpose_torch.commands.totals import Totals, figures_of
+from physpose_torch.commands.engines import refine_here, refine_on_ray
+from physpose_torch.commands.images import ImageOptions, Known
+from physpose_torch.commands.totals import Totals
 from physpose_torch.config import RefinerConfig
-from physpose_torch.errors import DataError
-from physpose_torch.refiner import PhysPoseRefiner, Refinement, silent_doubts
-from physpose_torch.report import PhysicsReport, physics_report
-from physpose_torch.scene import Scene
+from physpose_torch.errors import DataError, InvalidInputError
+from physpose_torch.files import replacing, write_file, written
 
 __all__ = ["Refine"]
 
-AT_A_TIME = 256
-"""Images whose rows are read at a time, at least."""
 logger = logging.getLogger("physpose_torch")
 
 
@@ -52,9 +45,14 @@ class Refine(ImageOptions):
 
     out: Path
     """Result file to write."""
+    engine: Literal["local", "ray"] = "local"
+    """local: in this process; ray: on all cores of this machine, or of a Ray cluster (RAY_ADDRESS) whose machines find the
+    files under the same paths. The poses are the same but for rounding."""
+    workers: int | None = None
+    """With --engine ray: batches at a time; default: one a core of the cluster."""
     resume: bool = False
-    """Go on where an earlier run with the same files and options stopped; if none did, begin. Only --batch, --json and
-    --quiet may differ; poses from other batches are equal but for rounding."""
+    """Go on where an earlier run with the same files and options stopped; if none did, begin. Only --batch, --engine,
+    --workers, --json and --quiet may differ; poses from other batches are equal but for rounding."""
     preset: str = "default"
     """default; lm: the same cost by fifteen Gauss-Newton steps; or paper: the paper's cost and gradient descent."""
     calibration: Path | None = None
@@ -69,6 +67,8 @@ class Refine(ImageOptions):
     def __call__(self) -> int:
         check_output(self.json, self.out)
         self.check()
+        if self.workers is not None and (self.engine == "local" or self.workers < 1):
+            raise InvalidInputError(f"--workers {self.workers}: expected a positive number, and --engine ray")
         out = self.out.resolve()  # of a link, the file it points to
         if out.exists() and not out.is_file():
             raise DataError(f"{self.out}: is no regular file; name a file to write")
@@ -80,8 +80,7 @@ class Refine(ImageOptions):
                 with written(out), replacing(out, temporary=out.with_name(f".{out.name}.tmp")) as file:
                     file.writelines(journal.merged(index))
                 if self.json is not None:
-                    with written(self.json):
-                        self.json.write_text(json.dumps(totals.summary(), indent=2) + "\n")
+                    write_file(self.json, json.dumps(totals.summary(), indent=2) + "\n")
             except KeyboardInterrupt:
                 if not journal.committed:
                     raise
@@ -106,22 +105,21 @@ class Refine(ImageOptions):
         known = self.known()
         for record in journal.begin(self._about(index, known), lines=index.lines):
             totals.add(record)
-        refiner = PhysPoseRefiner(self.config)
-        chosen = index.choose(self.scenes, self.every)
-        done, size = totals.counts["images"], max(AT_A_TIME, self.batch)
-        with progress(self._count(index), "refine", "image", quiet=self.quiet, initial=done) as bar:
-            # sums round differently in other batches, so those of a resumed run begin and end where they would have
-            while (start := totals.counts["images"]) < len(chosen):
-                keys = [(s, i) for s, i in index.keys[chosen[start : start - start % size + size]].tolist()]
-                estimates = index.read(index.numbers([*keys, *known.partners(keys)]))
-                for batch in in_batches(known.images(estimates, keys), self.batch):
-                    groups = together(batch, lambda images, rows=estimates: _refine(images, rows, refiner))
-                    record = _record(batch, groups, estimates)
-                    journal.commit(_rewritten(groups, estimates), record)
-                    totals.add(record)
-                    for image in batch:
-                        image.scene = None  # its memory is needed for the next ones
-                    bar.update(len(batch))
+        chosen, done = index.choose(self.scenes, self.every), totals.counts["images"]
+        # sums round differently in other batches, so those of a resumed run end where they would have
+        ends = np.arange(done - done % self.batch + self.batch, len(chosen), self.batch)
+        batches = [b for b in np.split(chosen[done:], ends - done) if len(b)]
+        refine = BatchRefiner(index, known, self.config)
+        if self.engine == "ray":
+            refined = refine_on_ray(refine, batches, workers=self.workers)
+        else:
+            refined = refine_here(refine, batches)
+        bar = progress(self._count(index), "refine", "image", quiet=self.quiet, initial=done)
+        with bar, closing(refined):
+            for batch in refined:
+                journal.commit(batch.rows, batch.record)
+                totals.add(batch.record)
+                bar.update(batch.record["images"])
             bar.update(bool(index.unplaced))
         if index.unplaced:
             totals.counts["images"] += 1
@@ -145,63 +143,6 @@ class Refine(ImageOptions):
             **{f"--{name.replace('_', '-')}": value for name, value in options.items()},
             "--config": dataclasses.asdict(self.config),
         }
-
-
-@dataclass
-class _Group:
-    images: Sequence[ImageScene]
-    result: Refinement
-    seconds: float
-    before: PhysicsReport
-
-    @property
-    def rows(self) -> np.ndarray:
-        return np.concatenate([i.rows for i in self.images])
-
-
-def _refine(images: Sequence[ImageScene], estimates: Estimates, refiner: PhysPoseRefiner) -> _Group:
-    start = time.perf_counter()
-    scene = Scene.cat([i.scene for i in images])
-    measured, scores = poses_of(images, estimates)
-    before = physics_report(measured, scene, scores=scores, backend=refiner.config.physics.backend)
-    with silent_doubts():  # told by the names of their images
-        result = refiner(measured, scene, scores=scores)
-    return _Group(images, result, time.perf_counter() - start, before)
-
-
-def _rewritten(groups: Sequence[_Group], estimates: Estimates) -> list[tuple[int, str]]:
-    """(line number, new text) of the rows of a batch that changed."""
-    poses, seconds = estimates.T_camera_object.clone(), np.zeros(len(estimates))
-    for group in groups:
-        poses[group.rows] = group.result.poses
-        seconds[group.rows] = group.seconds / len(group.images)
-    return [(int(estimates.line[row]), text) for row, text in rewrite_rows(estimates, poses, time=seconds)]
-
-
-def _record(batch: Sequence[ImageScene], groups: Sequence[_Group], estimates: Estimates) -> dict[str, Any]:
-    """What happened to a batch, for the journal and :meth:`Totals.add`."""
-    refined = [i for i in batch if not i.problems]
-    left: dict[str, list] = {"rejected": [], "unsupported": [], "doubted": []}
-    figures, doubts = [], []
-    for group in groups:
-        result = group.result
-        flags = (result.rejected, result.unsupported, result.doubted[result.image])
-        ids = [getattr(estimates, name)[group.rows] for name in ("line", "obj_id", "scene_id", "im_id")]
-        for rows, flag in zip(left.values(), flags, strict=True):
-            rows += np.stack(ids, axis=1)[flag.numpy()].tolist()
-        figures.append(figures_of(group.before, result.report, torch.stack(flags).any(0)))
-        doubts += [f"{i.name}: {d}" for i, d in zip(group.images, result.doubts, strict=True) if d]
-    return {
-        "images": len(batch),
-        "refined": len(refined),
-        "rows": sum(len(i.rows) for i in refined),
-        "righted": sum(int(g.result.righted.sum()) for g in groups),
-        "seconds": sum(g.seconds for g in groups),
-        "left": left,
-        "figures": figures,
-        "doubts": doubts,
-        "problems": [p for i in batch for p in i.problems],
-    }
 
 
 def _digest(path: Path | None) -> str | None:

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from physpose_torch.bop.atomic import write_text
 from physpose_torch.bop.formats import Estimates
 from physpose_torch.bop.scenes import ImageScene, poses_of
 from physpose_torch.commands.common import check_output, progress
 from physpose_torch.commands.images import ImageOptions, in_batches, together
+from physpose_torch.files import write_file
 from physpose_torch.losses import acting
 from physpose_torch.report import physics_report
 from physpose_torch.scene import Scene
@@ -43,7 +43,7 @@ class Report(ImageOptions):
     json: Path | None = None
     """Write every row's numbers and what could not be measured to this file."""
     backend: str = "auto"
-    """Distance backend: warp or fcl."""
+    """Distance backend: warp, fcl, or fcl-isolated (in a process of its own)."""
     quiet: bool = False
     """No progress bar and no table."""
 
@@ -62,7 +62,7 @@ class Report(ImageOptions):
                 bar.update(len(batch))
         if self.json is not None:
             content = {"images": measured, "rows": rows, "problems": problems}
-            write_text(self.json, json.dumps(content, indent=2, allow_nan=False) + "\n")
+            write_file(self.json, json.dumps(content, indent=2, allow_nan=False) + "\n")
         if not self.quiet:
             print(describe(rows, measured, statics=self.planes is not None or self.statics is not None))
         for problem in problems:

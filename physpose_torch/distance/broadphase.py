@@ -8,7 +8,10 @@ from torch import Tensor
 from physpose_torch.distance.smoothing import tangent_basis
 from physpose_torch.geometry.convex import ConvexParts
 
-__all__ = ["Bounds", "instance_bounds", "meeting_pairs", "pairs_below"]
+__all__ = ["Bounds", "instance_bounds", "meeting_pairs", "near_spheres", "pairs_below"]
+
+MOST_CANDIDATES = 1 << 21
+"""Pairs of spheres that are looked at at once."""
 
 
 class Bounds(NamedTuple):
@@ -29,6 +32,33 @@ def instance_bounds(T: Tensor, parts: ConvexParts, part: Tensor, gravity: Tensor
     local = parts.padded.to(T)[part]
     aligned = local @ (axes @ T[:, :3, :3]).mT + (axes @ T[:, :3, 3:]).mT
     return Bounds(aligned.amin(1), aligned.amax(1))
+
+
+def near_spheres(center: Tensor, radius: Tensor, margin: float) -> Tensor:
+    """Pairs (E, 2) of spheres that come within ``margin`` [m] of each other, the lesser index first, in order.
+
+    They are sorted along the axis of their largest spread, and each is held against those that begin before it ends.
+
+    Args:
+        center: (M, 3) [m]; radius: (M,) [m]; on the CPU, float64.
+    """
+    center = center - center[:1]
+    axis = int((center.amax(0) - center.amin(0)).argmax())
+    reach = (radius + 0.5 * margin) * (1 + 1e-9)  # rounding makes no pair fewer
+    low, order = (center[:, axis] - reach).sort()
+    center, reach = center[order], reach[order]
+    count = torch.searchsorted(low, center[:, axis] + reach, right=True) - torch.arange(1, len(low) + 1)
+    total = torch.cat([count.new_zeros(1), count.cumsum(0)])
+    found, begin = [order.new_zeros(0, 2)], 0
+    while begin < len(low):
+        end = max(int(torch.searchsorted(total, total[begin] + MOST_CANDIDATES, right=True)) - 1, begin + 1)
+        first = torch.repeat_interleave(torch.arange(begin, end), count[begin:end])
+        second = torch.arange(int(total[begin]), int(total[end])) - total[first] + first + 1
+        near = ((center[first] - center[second]) ** 2).sum(1) <= (reach[first] + reach[second]) ** 2
+        found.append(torch.stack([first[near], second[near]], dim=1))
+        begin = end
+    pairs = order[torch.cat(found)].sort(1).values
+    return pairs[torch.argsort(pairs[:, 0] * len(low) + pairs[:, 1])]
 
 
 def entity_bounds(bounds: Bounds, entity: Tensor, n_entities: int) -> Bounds:

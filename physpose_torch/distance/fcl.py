@@ -15,20 +15,21 @@ results only, planes never come here, and:
 
 import logging
 import weakref
+from collections.abc import Callable
 from dataclasses import dataclass
 
-import fcl
-import numpy as np
 import torch
 from torch import Tensor
 
+from physpose_torch.distance.fcl_worker import make_shape, nearest_points
 from physpose_torch.distance.gjk import closest_points
 from physpose_torch.distance.sat import separating_axis
 from physpose_torch.distance.support import gap_along
-from physpose_torch.errors import BackendError
 from physpose_torch.geometry.convex import ConvexParts
 
 __all__ = ["fcl_distance"]
+
+Ask = Callable[[ConvexParts, Tensor, Tensor, Tensor], tuple[Tensor, Tensor] | None]
 
 logger = logging.getLogger("physpose_torch")
 
@@ -39,23 +40,23 @@ PULL = 2e-3
 PROVEN = 1e-10
 """[m]; how far witness points may be from facing each other along the normal. Well apart, fcl meets 1e-14."""
 
-_REQUEST = fcl.DistanceRequest(enable_nearest_points=True, enable_signed_distance=True)
 _shapes: "weakref.WeakKeyDictionary[ConvexParts, list]" = weakref.WeakKeyDictionary()
 
 
-def fcl_distance(parts: ConvexParts, pairs: Tensor, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def fcl_distance(
+    parts: ConvexParts, pairs: Tensor, R: Tensor, t: Tensor, *, ask: Ask | None = None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Signed distances of pairs of parts, in the frame of part a.
 
     Args:
         parts: float64 parts on the CPU.
         pairs: (E, 2) indices of parts a and b.
         R: (E, 3, 3), t: (E, 3), pose of b in the frame of a [m].
+        ask: who asks fcl for the nearest points of such pairs that are apart, (E, 3) each, in the frame of a; None where it
+            has no answer. Default: this process.
 
     Returns:
         distance (E,), normal (E, 3) from a to b, witness points on a and on b (E, 3), in the frame of a [m].
-
-    Raises:
-        BackendError: fcl gave no finite answer.
     """
     center_a, center_b = parts.center[pairs[:, 0]], parts.center[pairs[:, 1]]
     across = (R @ center_b[:, :, None])[:, :, 0] + t - center_a
@@ -67,7 +68,8 @@ def fcl_distance(parts: ConvexParts, pairs: Tensor, R: Tensor, t: Tensor) -> tup
 
     answer = _Answer(parts, pairs, R, t, gap, normal)
     shift = torch.where(gap <= NEAR, PULL - gap, 0.0)[:, None] * normal
-    answer.consider(torch.arange(len(pairs)), *_ask(parts, pairs, R, t + shift), shift)
+    if (points := (ask or _ask)(parts, pairs, R, t + shift)) is not None:
+        answer.consider(torch.arange(len(pairs)), *points, shift)
     todo = answer.unproven()
     if len(todo):
         shift = shift[todo]
@@ -121,26 +123,6 @@ def _ask(parts: ConvexParts, pairs: Tensor, R: Tensor, t: Tensor) -> tuple[Tenso
     """fcl's nearest points of pairs that are apart, (E, 3) each, in the frame of part a."""
     shapes = _shapes.get(parts)
     if shapes is None:
-        shapes = _shapes[parts] = [_convex(*(x.numpy() for x in parts.part(p))) for p in range(parts.n_parts)]
-    points = np.empty((len(pairs), 2, 3))
-    identity = fcl.Transform()
-    for k, (a, b), rotation, translation in zip(range(len(pairs)), pairs.tolist(), R.numpy(), t.numpy(), strict=True):
-        result = fcl.DistanceResult()
-        fcl.distance(
-            fcl.CollisionObject(shapes[a], identity),
-            fcl.CollisionObject(shapes[b], fcl.Transform(rotation, translation)),
-            _REQUEST,
-            result,
-        )
-        points[k] = result.nearest_points
-    if not np.isfinite(points).all():
-        bad = int((~np.isfinite(points).all(axis=(1, 2))).nonzero()[0][0])
-        raise BackendError(f"python-fcl gave no finite witness points for parts {pairs[bad].tolist()}")
-    points = torch.from_numpy(points)
+        shapes = _shapes[parts] = [make_shape(*(x.numpy() for x in parts.part(p))) for p in range(parts.n_parts)]
+    points = torch.from_numpy(nearest_points(shapes, pairs.numpy(), R.numpy(), t.numpy()))
     return points[:, 0], points[:, 1]
-
-
-def _convex(vertices: np.ndarray, faces: np.ndarray) -> "fcl.Convex":
-    polygons = np.concatenate([np.full((len(faces), 1), 3), faces], axis=1).ravel()
-    return fcl.Convex(np.ascontiguousarray(vertices), len(faces), polygons)
-

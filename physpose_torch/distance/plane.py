@@ -19,6 +19,8 @@ def plane_distance(
 ) -> DistanceResult:
     """Signed distances of all parts to the half-space below one plane.
 
+    The error is at most 16 eps (that of the poses' dtype) of |t| + |offset| + the part's extent.
+
     Args:
         T: (P, 4, 4) pose of each part's body, T_camera_object [m].
         parts: P convex parts.

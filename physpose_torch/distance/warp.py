@@ -8,6 +8,7 @@ import contextlib
 import functools
 import logging
 import os
+import tempfile
 import threading
 import weakref
 from collections.abc import Iterator
@@ -48,6 +49,8 @@ logger = logging.getLogger("physpose_torch")
 REAL = {torch.float32: wp.float32, torch.float64: wp.float64}
 PATIENCE = 1.5
 """[s]; loading compiled kernels takes less."""
+ROOM = 1 << 22
+"""[bytes]; what a module takes when it is compiled is a fifth of this."""
 _structs: "weakref.WeakKeyDictionary[ConvexParts, dict]" = weakref.WeakKeyDictionary()
 
 
@@ -55,8 +58,38 @@ _structs: "weakref.WeakKeyDictionary[ConvexParts, dict]" = weakref.WeakKeyDictio
 def initialise() -> None:
     """Start Warp, quietly."""
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # no banner, no load times
-    with contextlib.nullcontext() if torch.cuda.is_available() else _silent():
-        wp.init()
+    quiet = contextlib.nullcontext if torch.cuda.is_available() else _silent
+    try:
+        if not (os.environ.get("WARP_CACHE_PATH") or os.path.isabs(os.path.expanduser("~"))):
+            raise FileNotFoundError("this user has no home folder")
+        with quiet():
+            wp.init()
+    except OSError as error:
+        _compile_elsewhere(error)
+        with quiet():
+            wp.init()
+
+
+@functools.cache
+def _temporary() -> tempfile.TemporaryDirectory:
+    """A folder for kernels that lasts as long as this process."""
+    return tempfile.TemporaryDirectory(prefix="physpose-kernels-", ignore_cleanup_errors=True)
+
+
+def _compile_elsewhere(error: Exception) -> None:
+    logger.warning(
+        "Warp's kernel cache cannot be used (%s): kernels are compiled for this process alone; "
+        "set WARP_CACHE_PATH to a writable folder",
+        error,
+    )
+    wp.config.kernel_cache_dir = _temporary().name
+
+
+def _make_sure_of_room(module: "wp.Module") -> None:
+    """OSError if a module has to be compiled and the disk is full: the compiler would abort the whole process."""
+    if not os.path.isdir(os.path.join(wp.config.kernel_cache_dir, module.get_module_identifier())):
+        with tempfile.TemporaryFile(dir=wp.config.kernel_cache_dir) as probe:
+            probe.write(bytes(ROOM))
 
 
 @contextlib.contextmanager
@@ -88,6 +121,8 @@ def ready(dtype: torch.dtype, device: torch.device) -> SimpleNamespace:
 def load(module: "wp.Module", device: torch.device) -> None:
     """Compile a module, or load it from Warp's cache, and say so if that takes a while.
 
+    Where the cache is read-only, full or damaged, a temporary folder takes its place.
+
     Raises:
         BackendError: it cannot be compiled.
     """
@@ -96,9 +131,21 @@ def load(module: "wp.Module", device: torch.device) -> None:
     notice.daemon = True
     notice.start()
     try:
-        loaded = module.load(wp.device_from_torch(device))
-    except Exception as error:  # of any kind, a compiler's
-        raise BackendError(f"Warp could not compile the distance kernels for {device}: {error}") from error
+        try:
+            _make_sure_of_room(module)
+            loaded = module.load(wp.device_from_torch(device))
+        except Exception as error:  # of any kind, a compiler's
+            if _temporary.cache_info().currsize:  # there already
+                raise
+            _compile_elsewhere(error)
+            module.mark_modified()  # what failed once is not tried again otherwise
+            _make_sure_of_room(module)
+            loaded = module.load(wp.device_from_torch(device))
+    except Exception as error:
+        message = f"Warp could not compile the distance kernels for {device}: {error}"
+        if isinstance(error, OSError):
+            message += "; set WARP_CACHE_PATH to a folder with some room, or use another backend ('fcl')"
+        raise BackendError(message) from error
     finally:
         notice.cancel()
     if loaded is None:

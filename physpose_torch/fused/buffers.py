@@ -10,16 +10,18 @@ from physpose_torch.distance.warp import fill, wrap
 from physpose_torch.prior import PosePrior
 from physpose_torch.scene import Scene
 
-__all__ = ["FAR", "make_prior", "make_state", "make_world"]
+__all__ = ["FAR", "make_prior", "make_state", "make_world", "renew_rows"]
 
 FAR = 1e30
 
 
-def make_world(k: SimpleNamespace, scene: Scene, acts: Tensor, dtype: torch.dtype, device: torch.device) -> Any:
-    """What stays; acts: (N,) bool, see :func:`physpose_torch.losses.acting`."""
+def make_world(
+    k: SimpleNamespace, scene: Scene, acts: Tensor, pairs: Tensor, dtype: torch.dtype, device: torch.device
+) -> Any:
+    """What stays; acts: (N,) bool, see :func:`physpose_torch.losses.acting`; pairs: (E, 2) entities that may meet."""
     n = len(scene)
     count = torch.bincount(scene.image, minlength=scene.n_images)
-    first, second = scene.entity_pairs.unbind(1)
+    first, second = pairs.unbind(1)
     felt = (second >= n) | acts[first] | acts[second.clamp_max(max(n - 1, 0))] if n else second >= n
     first, second = first[felt], second[felt]
     rows = scene.instance_start.diff()[first]
@@ -95,7 +97,6 @@ def make_state(
     """What changes, in the dtype and on the device of ``poses``, and the tensors that it is made of, which keep it alive."""
     n, images = len(scene), scene.n_images
     entities, instances = len(scene.entity_image), len(scene.instance_entity)
-    rows, slots = len(world._tensors["row_pair"]), int(world._tensors["row_slot"][-1])
     real = {"dtype": poses.dtype, "device": poses.device}
     whole = {"dtype": torch.int32, "device": poses.device}
     empty = torch.bincount(scene.image, minlength=images) == 0  # nothing to do
@@ -112,32 +113,49 @@ def make_state(
         **dict.fromkeys(("newton", "follow"), (n, 6)),
         "information": (images,),
         "plane_curvature": (n if lm else 0, 6, 6),
-        **dict.fromkeys(("row_curvature_a", "row_curvature_b"), (rows if lm else 0, 6, 6)),
         **dict.fromkeys(("pose_gradient", "plane_gradient", "gradient"), (n, 6)),
-        **dict.fromkeys(("row_cost", "row_depth", "row_drop_a", "row_drop_b"), (rows,)),
-        **dict.fromkeys(("row_force", "row_torque_a", "row_torque_b"), (rows, 3)),
     }
     counters = {
         "still": images,
         **dict.fromkeys(("plane_best", "plane_instance", "support"), n),
-        **dict.fromkeys(("row_count", "row_touches", "row_onto_a", "row_onto_b"), rows),
     }
     tensors = {name: torch.zeros(shape, **real) for name, shape in shapes.items()}
     tensors |= {name: torch.zeros(size, **whole) for name, size in counters.items()}
     tensors["poses"] = scene.entity_poses(poses).detach().to(**real).clone().contiguous()
-    tensors["clear"] = torch.full((rows,), -FAR, **real)
-    tensors["slot_clear"] = torch.full((slots,), -FAR, **real)
-    tensors["slot_aside"] = torch.full((slots,), -FAR, **real)
-    tensors["slot_normal"] = torch.zeros(slots, 3, **real)
     tensors["farthest"].fill_(FAR)  # nothing is at rest before it has moved
     tensors["done"] = empty.to(**whole)
     tensors["steps"] = torch.zeros(images, **whole)
-    kinds = {(3,): k.vec3, (6,): k.vec6, (4, 4): k.mat44, (6, 6): k.mat66}
     state = k.State()
-    for name, tensor in tensors.items():
-        kind = kinds.get(tuple(tensor.shape[1:]))
-        setattr(state, name, wrap(tensor, kind))
+    _set(k, state, tensors)
+    renew_rows(k, state, tensors, world, lm=lm)
     return state, tensors
+
+
+def renew_rows(k: SimpleNamespace, state: Any, tensors: dict[str, Tensor], world: Any, *, lm: bool) -> None:
+    """Forget what was known of parts against each other: room for the pairs that the world names now."""
+    rows, slots = len(world._tensors["row_pair"]), int(world._tensors["row_slot"][-1])
+    real = {"dtype": tensors["poses"].dtype, "device": tensors["poses"].device}
+    whole = {"dtype": torch.int32, "device": tensors["poses"].device}
+    shapes = {
+        **dict.fromkeys(("row_cost", "row_depth", "row_drop_a", "row_drop_b"), (rows,)),
+        **dict.fromkeys(("row_force", "row_torque_a", "row_torque_b"), (rows, 3)),
+        **dict.fromkeys(("row_curvature_a", "row_curvature_b"), (rows if lm else 0, 6, 6)),
+        "slot_normal": (slots, 3),
+    }
+    new = {name: torch.zeros(shape, **real) for name, shape in shapes.items()}
+    for name in ("row_count", "row_touches", "row_onto_a", "row_onto_b"):
+        new[name] = torch.zeros(rows, **whole)
+    for name, size in (("clear", rows), ("slot_clear", slots), ("slot_aside", slots)):
+        new[name] = torch.full((size,), -FAR, **real)
+    tensors.update(new)
+    tensors["moved"].zero_()
+    _set(k, state, new)
+
+
+def _set(k: SimpleNamespace, state: Any, tensors: dict[str, Tensor]) -> None:
+    kinds = {(3,): k.vec3, (6,): k.vec6, (4, 4): k.mat44, (6, 6): k.mat66}
+    for name, tensor in tensors.items():
+        setattr(state, name, wrap(tensor, kinds.get(tuple(tensor.shape[1:]))))
 
 
 def _starts(count: Tensor) -> Tensor:

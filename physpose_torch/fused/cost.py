@@ -3,6 +3,7 @@
 import functools
 import os
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from physpose_torch.config import STILL_STEPS, RefinerConfig, Smoothing
 from physpose_torch.distance.warp import REAL, initialise, load, parts_struct, wobble_struct, wrap
-from physpose_torch.fused.buffers import FAR, make_prior, make_state, make_world
+from physpose_torch.fused.buffers import FAR, make_prior, make_state, make_world, renew_rows
 from physpose_torch.fused.kernels import cost_kernels
 from physpose_torch.losses import PhysicsTerms
 from physpose_torch.prior import PosePrior
@@ -23,8 +24,19 @@ MOST_PAIRS = 50_000_000
 """Pairs of parts that a scene may have; each takes 40 bytes."""
 LEAST_ROWS = 2000
 """Fewer rows than this, some milliseconds of work, are not worth waiting for another thread."""
+LOOK_AROUND = 10
+"""Steps after which it is asked anew which bodies of a crowd are near each other."""
 LM_STILL_STEPS = 2
 """A Gauss-Newton step that moves nothing is nearly proof enough."""
+
+
+@functools.cache
+def _ready(dtype: torch.dtype, device: torch.device) -> SimpleNamespace:
+    """Kernels for a dtype, compiled for a device."""
+    initialise()
+    kernels = cost_kernels(REAL[dtype])
+    load(kernels.module, device)
+    return kernels
 
 
 @functools.cache
@@ -32,9 +44,9 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max(os.cpu_count() or 1, 2) - 1, "physpose_torch")
 
 
-def remembers(scene: Scene) -> bool:
-    """Whether every pair of parts can be remembered; a heap of thousands of objects in one image has too many."""
-    count = scene.instance_start.diff()[scene.entity_pairs]
+def remembers(scene: Scene, poses: Tensor, margin: float) -> bool:
+    """Whether every pair of parts of bodies within ``margin`` [m] can be remembered; a heap of thousands has too many."""
+    count = scene.instance_start.diff()[scene.near_pairs(scene.entity_poses(poses), margin)]
     return int((count[:, 0] * count[:, 1]).sum()) <= MOST_PAIRS
 
 
@@ -52,20 +64,31 @@ class Measured(NamedTuple):
 class _Fused:
     """A scene and its poses as the kernels see them, in place in torch tensors.
 
-    Finished images cost nothing: every kernel leaves them out, so the batch is never rebuilt and the host need not know.
+    Finished images cost nothing: every kernel leaves them out, so the batch is never rebuilt and the host need not know. Of a
+    crowd, only bodies within ``margin`` [m] of each other are held against each other.
     """
 
-    def __init__(self, scene: Scene, acts: Tensor, poses: Tensor, smoothing: Smoothing | None) -> None:
+    def __init__(
+        self, scene: Scene, acts: Tensor, poses: Tensor, smoothing: Smoothing | None, margin: float, *, lm: bool = False
+    ) -> None:
+        self._scene, self._acts, self._lm = scene, acts, lm
         self.n, self.n_images = len(scene), scene.n_images
         self.device, self.dtype = poses.device, poses.dtype
         self._on_cpu = self.device.type == "cpu"
-        initialise()
-        self._k = cost_kernels(REAL[self.dtype])
-        load(self._k.module, self.device)
+        self._k = _ready(self.dtype, self.device)
         self._parts = parts_struct(scene.parts, self.dtype, self.device)
         self._wobble = wobble_struct(smoothing, self.dtype, self.device)
-        self._world = make_world(self._k, scene, acts, self.dtype, self.device)
-        self._tensor: dict[str, Tensor] = {}
+        self._world = self._near(scene.entity_poses(poses), margin)
+        self._state, self._tensor = make_state(self._k, self._world, scene, poses, lm=lm)
+
+    def _near(self, T: Tensor, margin: float) -> Any:
+        pairs = self._scene.near_pairs(T, margin)
+        return make_world(self._k, self._scene, self._acts, pairs, self.dtype, self.device)
+
+    def _look_around(self, margin: float) -> None:
+        """Ask anew which bodies of a crowd are near each other; launches must be recorded anew."""
+        self._world = self._near(self._tensor["poses"], margin)
+        renew_rows(self._k, self._state, self._tensor, self._world, lm=self._lm)
 
     @property
     def poses(self) -> Tensor:
@@ -152,11 +175,11 @@ class FusedMeasure(_Fused):
         scene: the flat scene.
         acts: (N,) bool, see :func:`physpose_torch.losses.acting`.
         poses: (N, 4, 4).
+        margin: [m]; supports and contacts farther away than this are not looked for.
     """
 
-    def __init__(self, scene: Scene, acts: Tensor, poses: Tensor) -> None:
-        super().__init__(scene, acts, poses, None)
-        self._state, self._tensor = make_state(self._k, self._world, scene, poses, lm=False)
+    def __init__(self, scene: Scene, acts: Tensor, poses: Tensor, margin: float) -> None:
+        super().__init__(scene, acts, poses, None, margin)
 
 
 class FusedCost(_Fused):
@@ -176,9 +199,10 @@ class FusedCost(_Fused):
     ) -> None:
         physics = self._physics = config.physics
         smoothing = None if physics.smoothing.kind == "none" else physics.smoothing
-        super().__init__(scene, acts, poses, smoothing)
-        self._prior = make_prior(self._k, prior, scale, self.dtype, self.device)
         lm = config.solver == "lm"
+        super().__init__(scene, acts, poses, smoothing, self.margin(config, prior), lm=lm)
+        self._margin, self._moves = self.margin(config, prior), 0
+        self._prior = make_prior(self._k, prior, scale, self.dtype, self.device)
         options = self._k.Options()
         for name in ("pose_weight", "collision_weight", "gravity_weight", "softness"):
             setattr(options, name, getattr(physics, name))
@@ -190,16 +214,22 @@ class FusedCost(_Fused):
         options.max_gradient = FAR if config.max_gradient is None else config.max_gradient
         options.smooth, options.newton, options.damping = int(smoothing is not None), int(lm), config.damping
         options.still_steps = LM_STILL_STEPS if lm else STILL_STEPS
-        self._state, self._tensor = make_state(self._k, self._world, scene, poses, lm=lm)
         # the paper's gravity pulls from any height, but not towards nothing
         reach = torch.full_like(prior.reach, FAR / 2) if physics.gravity == "paper" else prior.reach
         self._tensor["reach"].copy_(reach)
         self.step = torch.zeros(self.n, 6, dtype=self.dtype, device=self.device)
+        self._options = options
         self._commands = self._record(self._launches(options))
 
     @staticmethod
+    def margin(config: RefinerConfig, prior: PosePrior) -> float:
+        """Bodies farther apart than this [m] have nothing to do with each other for some steps."""
+        reach = float(prior.reach.max()) if len(prior.reach) and config.physics.gravity != "paper" else 0.0
+        return max(reach, config.physics.contact_tolerance) + 2.01 * LOOK_AROUND * config.max_step
+
+    @staticmethod
     def fits(config: RefinerConfig, scene: Scene) -> bool:
-        """Whether the kernels know this cost, and remember all pairs of parts in the memory that there is.
+        """Whether the kernels know this cost.
 
         They know the paper's gravity above planes only, not above static bodies, and not its curvature.
         """
@@ -207,7 +237,7 @@ class FusedCost(_Fused):
         known = physics.smoothing.kind in ("ring", "gaussian", "none")
         if physics.gravity == "paper":
             known = known and config.solver == "descent" and len(scene.entity_image) == len(scene)
-        return known and remembers(scene)
+        return known
 
     @property
     def gradient(self) -> Tensor:
@@ -246,6 +276,9 @@ class FusedCost(_Fused):
 
     def evaluate(self, step: int) -> None:
         """Costs and gradient at the current poses; images that have come to rest are finished first."""
+        if self._scene.crowded and self._moves >= LOOK_AROUND:
+            self._look_around(self._margin)
+            self._commands, self._moves = self._record(self._launches(self._options)), 0
         self.settle(step)
         self._launch("boxes", "planes")
         self._launch_rows()
@@ -260,6 +293,13 @@ class FusedCost(_Fused):
     def move(self) -> None:
         """Move the objects by :attr:`step`, which is zero again then."""
         self._launch("move")
+        self._moves += 1
+
+    def measure(self, *, reach: float) -> Measured:
+        """Look at the poses as they are, for supports down to ``reach`` [m]. Nothing is left to do then."""
+        if self._scene.crowded:
+            self._look_around(reach)
+        return super().measure(reach=reach)
 
     def _launches(self, options: Any) -> dict[str, tuple[Any, int, list]]:
         k, state, world, parts, wobble = self._k, self._state, self._world, self._parts, self._wobble

@@ -1,7 +1,7 @@
 """What a scene is made of: rigid bodies with convex parts, and planes."""
 
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -20,10 +20,14 @@ from physpose_torch.reading import inside
 __all__ = ["FARTHEST", "Body", "Plane", "is_flat", "load_mesh", "read_mesh"]
 
 CYLINDER_SIDES = 32
+LARGEST = 10.0
+"""[m]; a mesh larger than this is in other units, unless its scale is given."""
+HOUSEHOLD = 0.25
+"""[m]; what is larger than ``LARGEST`` is cut into parts as finely as an object of this size."""
 FARTHEST = 1e6
 """[m]; no mesh has vertices beyond this."""
 ARCHIVES = (".zip", ".gz", ".bz2", ".zae", ".3mf", ".3dxml")
-LARGEST = 2_000_000_000
+LARGEST_FILE = 2_000_000_000
 """[bytes]; of a mesh file."""
 
 
@@ -50,7 +54,7 @@ class Body:
         mesh: trimesh.Trimesh | str | Path,
         *,
         label: str,
-        scale: float = 1.0,
+        scale: float | None = None,
         symmetries: Tensor | None = None,
         cache: bool = True,
         **coacd_options,
@@ -60,23 +64,30 @@ class Body:
         Args:
             mesh: a trimesh, or the path of any file that trimesh reads. Need not be watertight.
             label: name of the object.
-            scale: factor to metres: 0.001 for the millimetre meshes of BOP.
+            scale: factor to metres: 0.001 for the millimetre meshes of BOP. None: the mesh is in metres, and is refused if it
+                is larger than 10 m, as one in millimetres would be; with ``scale=1.0`` it is believed to be that large.
+                What is larger than 10 m is cut to 0.4 % of its size, unless ``tolerance`` is given.
             symmetries: (S, 4, 4) symmetry transforms [m] with the identity, if any.
             cache: keep the decomposition in the user's cache folder (``PHYSPOSE_CACHE`` moves it).
             **coacd_options: fields of :class:`~physpose_torch.geometry.decompose.DecomposeOptions`.
 
         Raises:
             DataError: the file is missing or cannot be read, or the mesh has no faces, NaN, or no volume.
-            InvalidInputError: it is larger than 10 m or smaller than 1 mm, as in other units; an option is unknown.
+            InvalidInputError: it is smaller than 1 mm, or larger than 10 m without a scale; an option is unknown.
         """
         raw = read_mesh(mesh, label)
+        believed, scale = scale is not None, 1.0 if scale is None else scale
         mesh = load_mesh(raw, label=label, scale=scale)
         try:
             options = DecomposeOptions(**coacd_options)
         except TypeError as error:
             known = ", ".join(DecomposeOptions.__dataclass_fields__)
             raise InvalidInputError(f"{label}: {error}; decomposition options are {known}") from error
-        hulls, report = decompose(mesh, options, cache=cache, name=label)
+        size = float(max(mesh.extents)) if len(mesh.faces) else 0.0
+        if believed and size > LARGEST:
+            hulls, report = _decompose_large(mesh, size, options, "tolerance" in coacd_options, cache=cache, name=label)
+        else:
+            hulls, report = decompose(mesh, options, cache=cache, name=label)
         symmetries, appearance = _checked_symmetries(symmetries, label), _appearance(raw, scale)
         return cls(label, ConvexParts.from_hulls(hulls), mesh, symmetries, report, appearance)
 
@@ -111,7 +122,8 @@ class Body:
         """A cylinder along z, centred at the origin; one part, a prism of 32 sides with the same radius [m]."""
         if not (np.isfinite([radius, height]).all() and radius > 0 and height > 0):
             raise InvalidInputError(f"{label}: radius = {radius}, height = {height}, expected positive lengths [m]")
-        mesh = trimesh.creation.cylinder(radius=radius, height=height, sections=CYLINDER_SIDES)
+        mesh = trimesh.creation.cylinder(radius=1.0, height=1.0, sections=CYLINDER_SIDES)  # trimesh drops small triangles
+        mesh.vertices = mesh.vertices * [radius, radius, height]
         rim = mesh.vertices[np.linalg.norm(mesh.vertices[:, :2], axis=1) > 0.5 * radius]
         return cls(label, ConvexParts.from_hulls([rim]), mesh)
 
@@ -224,7 +236,7 @@ def read_mesh(mesh: trimesh.Trimesh | str | Path, label: str) -> trimesh.Trimesh
             raise DataError(f"{label}: no mesh file {path}")
         if path.suffix.lower() in ARCHIVES:  # a few bytes can become gigabytes
             raise DataError(f"{label}: {path} is an archive; unpack it, and name the mesh in it")
-        if (size := path.stat().st_size) > LARGEST:
+        if (size := path.stat().st_size) > LARGEST_FILE:
             raise DataError(f"{label}: {path} has {size / 1e9:.1f} GB; simplify the mesh, or is it the right file?")
         try:
             mesh = trimesh.load_mesh(path, process=False, resolver=_Beside(str(path)))
@@ -271,6 +283,18 @@ def _appearance(mesh: trimesh.Trimesh, scale: float) -> trimesh.Trimesh | None:
         if visual.uv is None or image is None or len(visual.uv) != len(mesh.vertices):
             return None
     return trimesh.Trimesh(np.asarray(mesh.vertices) * scale, mesh.faces, visual=visual.copy(), process=False)
+
+
+def _decompose_large(
+    mesh: trimesh.Trimesh, size: float, options: DecomposeOptions, own_tolerance: bool, **keywords
+) -> tuple[list[np.ndarray], DecomposeReport]:
+    """A mesh of ``size`` [m] decomposed as if it were an object on a table: errors are a share of its size."""
+    factor = size / HOUSEHOLD
+    if own_tolerance:
+        options = replace(options, tolerance=options.tolerance / factor)
+    hulls, report = decompose(mesh.copy().apply_scale(1 / factor), options, **keywords)
+    errors = {name: factor * getattr(report, name) for name in ("outward_p95", "outward_max", "inward_p95", "inward_max")}
+    return [factor * hull for hull in hulls], report._replace(**errors)
 
 
 def is_flat(mesh: trimesh.Trimesh) -> bool:

@@ -47,7 +47,7 @@ def clean_mesh(mesh: trimesh.Trimesh, name: str) -> trimesh.Trimesh:
     if not 1e-3 <= size <= 10:
         raise InvalidInputError(
             f"{name} is {size:.4g} m large, expected 0.001 to 10: vertices are in metres; pass scale=0.001 "
-            "(or mesh.apply_scale(0.001)) for a mesh in millimetres"
+            "(or mesh.apply_scale(0.001)) for a mesh in millimetres, or scale=1.0 to Body.from_mesh if it is that large"
         )
     grid, _, index = _unique_rows(np.round(corners * 1e9).astype(np.int64))
     faces = index.reshape(-1, 3)

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import logging
 import os
+import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 import warnings
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
@@ -23,10 +23,10 @@ from typing import NamedTuple
 
 import fast_simplification
 import numpy as np
-import platformdirs
 import trimesh
 
-from ..errors import BackendError, InvalidInputError
+from ..errors import BackendError, DataError, InvalidInputError
+from ..files import cache_folder, one_at_a_time, remove_abandoned, replacing
 from .cover import Surface, clean_mesh, measure_cover
 from .hulls import few_vertices, fewest_parts, hand_out_extremes
 
@@ -38,6 +38,7 @@ ALGORITHM_VERSION = 3  # part of the cache key: raise it whenever results change
 _LARGEST = 100_000_000  # bytes that a cache file may unpack to
 FINENESS = (3.0, 2.0)  # CoACD's concavity thresholds to try, in tolerances
 _warned: set[bytes] = set()  # meshes whose fallback has been reported
+_unwritable: set[Path | None] = set()  # cache folders of which that has been reported
 _LIMITS = {
     "tolerance": (Real, 1e-5, 1.0),
     "max_hulls": (Integral, 1, 10_000),
@@ -67,7 +68,8 @@ class DecomposeOptions:
     max_faces: int = 2000
     """The mesh is simplified to this many triangles for CoACD; vertices are put back onto the full mesh afterwards."""
     time_limit_s: float = 120.0
-    """CoACD is killed after this time [s] and the convex hull is taken instead (with a warning, and not cached)."""
+    """CoACD is killed after this time [s] and the convex hull is taken instead (with a warning, and not cached). So it is if it
+    crashes; if somebody else kills it, for want of memory say, it is tried once more before."""
     seed: int = 0
     """CoACD's random seed."""
 
@@ -102,52 +104,86 @@ class Decomposition(NamedTuple):
 
 
 _CHILD = """
-import signal, sys
+import io, os, sys, threading, time
+def watch():
+    while os.getppid() == int(sys.argv[1]):
+        time.sleep(0.2)
+    os._exit(1)
+if os.name == "posix":
+    threading.Thread(target=watch, daemon=True).start()  # it ends by itself should the parent be killed
+result = os.dup(1)
+os.dup2(2, 1)  # what C code prints is not the result
 import coacd, numpy
-if hasattr(signal, "alarm"):
-    signal.alarm(int(sys.argv[2]))  # it ends by itself should the parent be killed
 coacd.set_log_level("error")
-with numpy.load(sys.argv[1] + "/in.npz") as data:
+with numpy.load(io.BytesIO(sys.stdin.buffer.read())) as data:
     parts = coacd.run_coacd(
         coacd.Mesh(data["vertices"], data["faces"]), threshold=float(data["threshold"]), seed=int(data["seed"]),
         preprocess_mode=str(data["preprocess_mode"]), preprocess_resolution=30, real_metric=True, merge=False,
         mcts_nodes=10, mcts_iterations=60)
 parts = [vertices for vertices, _ in parts]
-numpy.savez(sys.argv[1] + "/out.npz", vertices=numpy.concatenate(parts), counts=[len(p) for p in parts])
+with open(result, "wb") as file:
+    numpy.savez(file, vertices=numpy.concatenate(parts), counts=[len(p) for p in parts])
 """
 _child_command = [sys.executable, "-P", "-c", _CHILD]  # a program text, not an import: works from scripts and notebooks
+_OUTSIDE = {-getattr(signal, name, 0) for name in ("SIGKILL", "SIGTERM", "SIGINT", "SIGHUP")} - {0}
+
+
+class _KilledError(BackendError):
+    """CoACD ran out of memory, or was killed by somebody else: no fault of the mesh."""
 
 
 def _run_coacd(
     vertices: np.ndarray, faces: np.ndarray, *, deadline: float, stop: threading.Event, **settings
 ) -> list[np.ndarray]:
-    """CoACD's parts as vertex arrays [m]; BackendError if the child crashes, is stopped, or runs past the deadline."""
+    """CoACD's parts as vertex arrays [m]; BackendError if the child crashes, is stopped, or runs past the deadline.
+
+    A child that was killed from outside, or had no memory, gets a second chance. Nothing is written to disk.
+    """
+    try:
+        return _ask_child(vertices, faces, deadline=deadline, stop=stop, **settings)
+    except _KilledError as error:
+        logger.warning("%s; it is tried once more", error)
+        return _ask_child(vertices, faces, deadline=deadline, stop=stop, **settings)
+
+
+def _ask_child(vertices, faces, *, deadline: float, stop: threading.Event, **settings) -> list[np.ndarray]:
     limit = max(deadline - time.monotonic(), 0)
-    with tempfile.TemporaryDirectory(prefix="physpose_", ignore_cleanup_errors=True) as folder:
-        np.savez(f"{folder}/in.npz", vertices=vertices, faces=faces, **settings)
+    given = io.BytesIO()
+    np.savez(given, vertices=vertices, faces=faces, **settings)
+    try:
         child = subprocess.Popen(
-            [*_child_command, folder, str(int(limit) + 5)],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
+            [*_child_command, str(os.getpid())],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+            start_new_session=True,  # Ctrl-C is for us, who then stop it
         )
-        try:
-            while True:
-                try:
-                    _, message = child.communicate(timeout=0.2)
-                    break
-                except subprocess.TimeoutExpired:
-                    if stop.is_set() or time.monotonic() > deadline:
-                        raise BackendError(f"CoACD was stopped after {limit:.0f} s") from None
-        finally:  # also on KeyboardInterrupt
-            child.kill()
-            child.wait()
-        if child.returncode != 0:
-            tail = message.decode(errors="replace").strip().splitlines()[-1:]
-            raise BackendError(f"CoACD's process ended with code {child.returncode} {' '.join(tail)}")
-        with np.load(f"{folder}/out.npz") as data:
+    except OSError as error:
+        raise _KilledError(f"CoACD's process cannot be started ({error.strerror})") from error
+    try:
+        content = given.getvalue()
+        while True:
+            try:
+                found, message = child.communicate(content, timeout=0.2)
+                break
+            except subprocess.TimeoutExpired:
+                content = None  # it is on its way
+                if stop.is_set() or time.monotonic() > deadline:
+                    raise BackendError(f"CoACD was stopped after {limit:.0f} s") from None
+    finally:  # also on KeyboardInterrupt
+        child.kill()
+        child.wait()
+    if child.returncode != 0:
+        tail = message.decode(errors="replace").strip().splitlines()[-1:]
+        starved = any(word in message for word in (b"MemoryError", b"bad_alloc"))
+        kind = _KilledError if starved or child.returncode in _OUTSIDE else BackendError
+        raise kind(" ".join([f"CoACD's process ended with code {child.returncode}", *tail]))
+    try:
+        with np.load(io.BytesIO(found)) as data:
             return np.split(data["vertices"], np.cumsum(data["counts"])[:-1])
+    except Exception as error:  # of any kind, see _load
+        raise BackendError(f"CoACD's answer cannot be read ({error})") from error
 
 
 def _cut(
@@ -167,59 +203,72 @@ def _cut(
             return hand_out_extremes(
                 [surface.snap(part, options.tolerance) for part in parts], surface, options.tolerance
             )
-        except BackendError:
-            if mode == modes[-1] or time.monotonic() > deadline:
+        except BackendError as error:
+            if mode == modes[-1] or time.monotonic() > deadline or isinstance(error, _KilledError):
                 raise
     raise AssertionError("unreachable")
 
 
 def _cut_and_merge(mesh: trimesh.Trimesh, surface: Surface, options: DecomposeOptions, stop: threading.Event):
-    """Cut finer until the final hulls are within tolerance, else return the best parts.
+    """Cut finer until the final hulls are within tolerance, else return the best parts, their errors, and a warning or None.
 
     One coarse cut first: most models need no other, and time and parts grow with the square of fineness.
     """
-    best, limits = None, {k: getattr(options, k) for k in ("tolerance", "max_hulls", "max_vertices")}
+    best, warning, limits = None, None, {k: getattr(options, k) for k in ("tolerance", "max_hulls", "max_vertices")}
     for fineness in FINENESS:
         try:
             parts = _cut(mesh, surface, options, fineness * options.tolerance, stop)
-        except BackendError:
+        except BackendError as error:
             if best is None or stop.is_set():
                 raise
+            if isinstance(error, _KilledError):
+                warning = f"{error}; its parts are coarser than they could be"
             break
         found = fewest_parts(parts, surface, **limits, stop=stop)
         if best is None or found[1]["outward_p95"] < best[1]["outward_p95"]:
             best = found
         if best[1]["outward_p95"] <= options.tolerance or len(best[0]) >= options.max_hulls:
             break  # within tolerance, or short of parts, not of fineness
-    return best
+    return *best, warning
 
 
 def _decompose(mesh, options: DecomposeOptions, cache: bool, name: str, stop: threading.Event) -> Decomposition:
-    start = time.perf_counter()
     mesh = clean_mesh(mesh, name)
     path = _cache_path(mesh, options) if cache else None
-    if path and (found := _load(path)):
+    if path is None:
+        return _work_out(mesh, options, name, stop)
+    if found := _load(path):
         return found
+    with one_at_a_time(path, patience=2 * options.time_limit_s, stop=stop) as waited:
+        if waited and (found := _load(path)):
+            return found
+        result = _work_out(mesh, options, name, stop)
+        if result.report.warning is None:  # neither a time-out nor a kill must stick
+            _store(path, result)
+        return result
+
+
+def _work_out(mesh: trimesh.Trimesh, options: DecomposeOptions, name: str, stop: threading.Event) -> Decomposition:
+    start = time.perf_counter()
     surface, warning = Surface(np.array(mesh.triangles), mesh.is_watertight), None
     whole = [few_vertices(mesh.vertices, options.max_vertices, options.tolerance)]
     method, parts, errors = "convex", whole, measure_cover(whole, surface, options.tolerance)
     if max(errors["outward_p95"], errors["inward_p95"]) > options.tolerance:
         try:
-            cut_parts, cut_errors = _cut_and_merge(mesh, surface, options, stop)
+            cut_parts, cut_errors, warning = _cut_and_merge(mesh, surface, options, stop)
             if cut_errors["outward_p95"] < errors["outward_p95"]:  # else cutting was of no use
                 method, parts, errors = "coacd", cut_parts, cut_errors
         except BackendError as error:
             if stop.is_set():
                 raise
-            method, warning = "hull", f"{name}: {error}; its convex hull is used instead"
-            if (content := _digest(mesh)) not in _warned:  # once per mesh, not on every call
-                _warned.add(content)
-                warnings.warn(warning, stacklevel=3)
+            method, warning = "hull", f"{error}; its convex hull is used instead"
+    if warning is not None:
+        warning = f"{name}: {warning}"
+        if (content := _digest(mesh)) not in _warned:  # once per mesh, not on every call
+            _warned.add(content)
+            warnings.warn(warning, stacklevel=4)
     report = DecomposeReport(method, len(parts), **errors, seconds=time.perf_counter() - start, warning=warning)
-    result = Decomposition(parts, report)
-    if path and warning is None:  # a time-out must not stick
-        _store(path, result)
-    return result
+    return Decomposition(parts, report)
 
 
 def _digest(mesh: trimesh.Trimesh) -> bytes:
@@ -229,12 +278,16 @@ def _digest(mesh: trimesh.Trimesh) -> bytes:
     return content.digest()
 
 
-def _cache_path(mesh: trimesh.Trimesh, options: DecomposeOptions) -> Path:
-    folder = os.environ.get("PHYSPOSE_CACHE") or platformdirs.user_cache_dir("physpose_torch")
+def _cache_path(mesh: trimesh.Trimesh, options: DecomposeOptions) -> Path | None:
+    try:
+        folder = cache_folder("decompose")
+    except OSError as error:
+        _not_cached(None, error)
+        return None
     choices = {k: v for k, v in asdict(options).items() if k != "time_limit_s"}
     key = hashlib.sha256(json.dumps([ALGORITHM_VERSION, choices], sort_keys=True).encode())
     key.update(_digest(mesh))
-    return Path(folder) / "decompose" / f"{key.hexdigest()}.npz"
+    return folder / f"{key.hexdigest()}.npz"
 
 
 def _load(path: Path) -> Decomposition | None:
@@ -243,42 +296,43 @@ def _load(path: Path) -> Decomposition | None:
             if sum(entry.file_size for entry in archive.infolist()) > _LARGEST:
                 raise ValueError("too large")
         with np.load(path, allow_pickle=False) as data:
-            vertices, counts = data["vertices"], data["counts"]
-            report = DecomposeReport(**json.loads(str(data["report"])))
-        _check(vertices, counts, report)
-        return Decomposition(np.split(vertices, np.cumsum(counts)[:-1]), report)
-    except FileNotFoundError:
+            if torn := data.zip.testzip():
+                raise DataError(f"{torn} is damaged")
+            hulls = np.split(data["vertices"], np.cumsum(data["counts"])[:-1])
+            found = Decomposition(hulls, DecomposeReport(**json.loads(str(data["report"]))))
+        if len(hulls) != found.report.n_parts or not all(_sound(hull) for hull in hulls):
+            raise DataError("it has other parts than it says")
+        return found
+    except (FileNotFoundError, NotADirectoryError):
         return None
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except Exception as error:  # of any kind: zipfile, zlib, struct and ast meet what was torn or written over
         logger.warning("cache file %s is unreadable (%s): computed anew", path, error)
         return None
 
 
-def _check(vertices: np.ndarray, counts: np.ndarray, report: DecomposeReport) -> None:
-    """ValueError unless these are hulls, and their report."""
-    if vertices.dtype != np.float64 or vertices.shape[1:] != (3,) or not (np.abs(vertices) < 1e3).all():
-        raise ValueError(f"vertices {vertices.dtype} {vertices.shape}")
-    if counts.ndim != 1 or counts.dtype.kind not in "iu" or not (counts > 3).all() or counts.sum() != len(vertices):
-        raise ValueError(f"{counts} vertices of parts")
-    if report.method not in ("convex", "coacd", "hull") or report.n_parts != len(counts) or report.warning is not None:
-        raise ValueError("another report")
-    if not all(isinstance(x, float) and 0 <= x < np.inf for x in report[2:7]):
-        raise ValueError("errors that are no lengths")
+def _sound(hull: np.ndarray) -> bool:
+    return hull.dtype == np.float64 and hull.shape == (len(hull), 3) and len(hull) > 3 and bool((np.abs(hull) < 1e3).all())
 
 
 def _store(path: Path, result: Decomposition) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
+        remove_abandoned(path.parent, ".*.tmp")
+        with replacing(path) as file:  # readers and other writers never see half a file
             np.savez_compressed(
                 file,
                 vertices=np.concatenate(result.hulls),
                 counts=[len(h) for h in result.hulls],
                 report=json.dumps(result.report._asdict()),
             )
-        os.replace(file.name, path)  # atomic: readers and other writers never see half a file
     except OSError as error:
-        logger.warning("decomposition is not cached: %s (set PHYSPOSE_CACHE to a writable folder)", error)
+        _not_cached(path.parent, error)
+
+
+def _not_cached(folder: Path | None, error: OSError) -> None:
+    if folder not in _unwritable:  # once, not for every mesh
+        _unwritable.add(folder)
+        logger.warning("decompositions are not cached: %s (set PHYSPOSE_CACHE to a writable folder)", error)
 
 
 def decompose(
@@ -290,7 +344,8 @@ def decompose(
         mesh: triangles in metres; closed or not, merged or not.
         options: tolerances and limits.
         cache: look the result up, and keep it, in ``$PHYSPOSE_CACHE/decompose`` (default: the user's cache folder).
-            The key is made of the triangles (rounded to 1e-9 m, in any order) and the options.
+            The key is made of the triangles (rounded to 1e-9 m, in any order) and the options. Where it cannot be read or
+            written there is a warning, once; what is damaged is computed anew; what another process is at is waited for.
         name: what errors and warnings call the mesh.
 
     Returns:

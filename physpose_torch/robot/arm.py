@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from physpose_torch.errors import DataError
+from physpose_torch.files import write_file
 from physpose_torch.robot.gripper import Gripper
 
 __all__ = ["LOOK_ALONG", "LOOK_DOWN", "demo_arm"]
@@ -93,12 +93,8 @@ def demo_arm(path: str | Path, *, gripper: Gripper | None = None) -> Path:
     _link(robot, "camera", 0.09, [("box", HOUSING, (0.0, 0.0, -0.5 * HOUSING[2]))])
     _joint(robot, "camera_joint", "fixed", "hand", "camera", CAMERA, rpy=(0, 0, -0.5 * math.pi))
     ElementTree.indent(robot)
-    path = Path(path)
-    try:
-        ElementTree.ElementTree(robot).write(path, encoding="utf-8", xml_declaration=True)
-    except OSError as error:
-        raise DataError(f"{path} cannot be written ({error.strerror}); name a file in a folder that exists") from error
-    return path
+    write_file(path, ElementTree.tostring(robot, encoding="utf-8", xml_declaration=True))
+    return Path(path)
 
 
 def _round(segment: _Segment) -> tuple[str, tuple[float, ...], tuple[float, float, float]]:

@@ -128,9 +128,9 @@ def make_cost(
 ) -> "GeneralCost | FusedCost":
     """The cost at hand: compiled kernels where they know it, else autograd."""
     if chosen_backend(config.physics.backend) == "warp":
-        from physpose_torch.fused import FusedCost
+        from physpose_torch.fused import FusedCost, remembers
 
-        if FusedCost.fits(config, scene):
+        if FusedCost.fits(config, scene) and remembers(scene, poses, FusedCost.margin(config, prior)):
             return FusedCost(prior, scene, acts, config, poses, scale)
     if config.solver == "lm":
         raise InvalidInputError(

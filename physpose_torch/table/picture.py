@@ -114,7 +114,7 @@ def table_picture(
         legend += [colors[value] for value in (True, False) if any(bool(standing[k]) == value for k in drawn)]
     picture = ink.framed(np.round(canvas * 255).astype(np.uint8), legend, title, caption, unit)
     if path is not None:
-        picture.save(path, optimize=True)
+        ink.save(picture, path, optimize=True)
     return picture
 
 

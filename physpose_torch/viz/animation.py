@@ -12,6 +12,7 @@ from torch import Tensor
 from physpose_torch.errors import InvalidInputError
 from physpose_torch.report import physics_report
 from physpose_torch.scene import Scene
+from physpose_torch.viz import ink
 from physpose_torch.viz.scene import SceneView, cropped, place, side_view, surfaces_of, table_frame, table_rect
 from physpose_torch.viz.shading import RED, Shadows, shade
 
@@ -43,9 +44,8 @@ class Animation:
     def save(self, path: str | Path) -> None:
         """Write a GIF that repeats without end."""
         first, *rest = self._quantised()
-        first.save(
-            path, save_all=True, append_images=rest, duration=self.milliseconds, loop=0, optimize=False, disposal=1
-        )
+        moving = {"save_all": True, "append_images": rest, "duration": self.milliseconds, "loop": 0, "disposal": 1}
+        ink.save(first, path, optimize=False, **moving)
 
     def _quantised(self) -> "list[Image]":
         """One palette for all frames: what stands still keeps its colour, and costs nothing."""

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from physpose_torch.errors import InvalidInputError
+from physpose_torch.viz import ink
 from physpose_torch.viz.ellipsoids import UNSURE, checked_covariance, draw_ellipsoids
 from physpose_torch.viz.scene import FAR, SceneView, cropped, place, side_view, surfaces_of, table_frame, table_rect
 from physpose_torch.viz.shading import RED, Shadows, shade
@@ -114,7 +115,7 @@ def before_after_picture(
     note = f"{sigmas:g}σ of the origins" if any(c is not None for c in unsure) else None
     picture = _compose(panels, titles, captions, scales, note)
     if path is not None:
-        picture.save(path, optimize=True)
+        ink.save(picture, path, optimize=True)
     return picture
 
 

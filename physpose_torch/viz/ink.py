@@ -3,16 +3,21 @@
 An image is (H, W, 3) float, 0 to 1, while it is drawn on. OpenCV, scipy, matplotlib (text) and pillow are imported on use.
 """
 
+import io
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from torch import Tensor
 
+from physpose_torch.errors import InvalidInputError
+from physpose_torch.files import write_file
+
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-__all__ = ["DARK", "SAMPLES", "SHIFT", "cover", "discs", "fixed", "framed", "lines", "mix", "outline", "rgb"]
+__all__ = ["DARK", "SAMPLES", "SHIFT", "cover", "discs", "fixed", "framed", "lines", "mix", "outline", "rgb", "save"]
 
 DARK = "#0b2545"
 SHIFT = 4  # fractional bits of coordinates that OpenCV draws at
@@ -76,6 +81,23 @@ def outline(canvas: np.ndarray, mask: np.ndarray, color: str, unit: float) -> np
     distance = sigma * np.abs(ndtri(blurred.clip(1e-9, 1 - 1e-9)))  # of a straight border, exactly [px]
     canvas = mix(canvas, DARK, 0.35 * (0.5 + 1.5 * unit - distance).clip(0, 1))
     return mix(canvas, color, (0.5 + 0.8 * unit - distance).clip(0, 1))
+
+
+def save(picture: "Image", path: str | Path, **options: Any) -> None:
+    """Write an image file as a whole or not at all, in the format that its ending names. Options are pillow's.
+
+    Raises:
+        InvalidInputError: nothing is known that ends so.
+        DataError: the file cannot be written; what was there before is kept.
+    """
+    from PIL import Image
+
+    kind = Image.registered_extensions().get(Path(path).suffix.lower())
+    if kind not in Image.SAVE:
+        raise InvalidInputError(f"{path}: pictures are not written as {Path(path).suffix or 'files without ending'}; try .png")
+    content = io.BytesIO()
+    picture.save(content, kind, **options)
+    write_file(path, content.getvalue())
 
 
 def framed(

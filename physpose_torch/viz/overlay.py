@@ -116,7 +116,7 @@ def overlay_picture(
     notes = [(str(text), _places(seen, k, drop, unit)) for k, text in enumerate(labels) if text]
     picture = ink.framed(np.round(canvas * 255).astype(np.uint8), legend if n else [], title, caption, unit, notes)
     if path is not None:
-        picture.save(path, optimize=True)
+        ink.save(picture, path, optimize=True)
     return picture
 
 

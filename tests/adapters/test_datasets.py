@@ -173,6 +173,9 @@ def test_meshes_in_metres_are_read_as_such(tmp_path):
         bodies_from_folder(tmp_path)
     with pytest.raises(InvalidInputError, match="'cm'"):
         bodies_from_folder(tmp_path, mesh_units="cm")
+    mesh_file(tmp_path, extents=(100.0, 60.0, 40.0))
+    with pytest.raises(InvalidInputError, match="100 m large"):
+        bodies_from_folder(tmp_path, mesh_units="m")
 
 
 def test_folders_that_leave_it_open_are_refused(tmp_path):

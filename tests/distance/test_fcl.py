@@ -46,9 +46,9 @@ def oracle(parts, pairs, R, t):
     return torch.tensor(out, dtype=torch.float64)
 
 
-def assert_exact(parts, pairs, R, t, expected, atol=EXACT):
+def assert_exact(parts, pairs, R, t, expected, atol=EXACT, *, of=fcl_distance):
     """Distance, sign, normal and witness points agree with one another and with the expected distance."""
-    distance, normal, a, b = fcl_distance(parts, pairs, R, t)
+    distance, normal, a, b = of(parts, pairs, R, t)
     torch.testing.assert_close(distance, expected, atol=atol, rtol=0.0)
     clear = expected.abs() > 2 * atol
     assert (distance.sign() == expected.sign())[clear].all()

