@@ -48,6 +48,10 @@ def _run(argv: Sequence[str] | None) -> int:
     except BrokenPipeError:  # the reader, head say, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except OSError as error:  # of a folder that may not be looked into, say
+        where = "" if error.filename is None else f"{error.filename}: "
+        print(f"physpose: error: {where}{error.strerror or error}; check the path, and who may use it", file=sys.stderr)
+        return 2
 
 
 if __name__ == "__main__":

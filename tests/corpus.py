@@ -1,5 +1,8 @@
 """Broken files by the thousand: bytes flipped, cut, repeated and shuffled, numbers replaced by what is none."""
 
+import copy
+import json
+import math
 import random
 import re
 
@@ -62,3 +65,70 @@ def _shuffled(data, rng):
     lines = data.split(b"\n")
     rng.shuffle(lines)
     return b"\n".join(lines)
+
+
+HUGE = 10**400
+"""More than a float holds."""
+
+
+def nested(depth: int) -> list:
+    """Lists within lists."""
+    value: list = []
+    for _ in range(depth):
+        value = [value]
+    return value
+
+
+# fmt: off
+VALUES = [
+    None, True, False, 0, -1, 1, 2**31, 2**63, HUGE, 1e308, -1e308, 1e-320, 1e15, math.nan, math.inf, "", "1", "all",
+    "nan", "\x00", "\ud800", "é" * 300, "../leaves", "/dev/zero", [], {}, [[]], [None] * 3, [1.0] * 3, [0.0] * 9,
+    [math.nan] * 3, [HUGE] * 3, [0] * 16, {"0": 0}, {"": []}, nested(80),
+]
+# fmt: on
+"""What stands where another value did in a JSON file."""
+
+
+def mutated_json(data: bytes, seed: int) -> bytes:
+    """A JSON file that is still one, but broken in one or a few places; the same for the same seed."""
+    rng = random.Random(seed)
+    content = [json.loads(data)]  # the file itself can be replaced, too
+    for _ in range(rng.choice([1, 1, 1, 2, 5])):
+        content = content or [None]
+        holder, key = rng.choice(list(_places(content)))
+        rng.choice([_valued, _valued, _scaled, _dropped, _doubled, _swapped])(holder, key, rng)
+    return json.dumps(content[0] if content else None).encode()
+
+
+def _places(node):
+    """(container, key) of all that is in a JSON value."""
+    for key, value in node.items() if isinstance(node, dict) else enumerate(node):
+        yield node, key
+        if isinstance(value, dict | list) and value:
+            yield from _places(value)
+
+
+def _valued(holder, key, rng):
+    holder[key] = copy.deepcopy(rng.choice(VALUES))
+
+
+def _scaled(holder, key, rng):
+    """Another unit, or the other direction."""
+    if type(holder[key]) in (int, float) and abs(holder[key]) < 1e15:
+        holder[key] *= rng.choice([1000, 0.001, -1, 1e9])
+
+
+def _dropped(holder, key, rng):
+    del holder[key]
+
+
+def _doubled(holder, key, rng):
+    if isinstance(holder, list):
+        holder.insert(key, copy.deepcopy(holder[key]))
+    else:
+        holder[f"0{key}"] = copy.deepcopy(holder[key])
+
+
+def _swapped(holder, key, rng):
+    other = rng.choice(list(holder) if isinstance(holder, dict) else range(len(holder)))
+    holder[key], holder[other] = holder[other], holder[key]

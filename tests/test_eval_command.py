@@ -272,7 +272,7 @@ def colour_of_other_size(root, path):
     ("spoil", "words"),
     [
         (without_scale, ["scene_camera.json, image 3", "'depth_scale'", "add it"]),
-        (lambda root, path: path.write_bytes(b"no image"), ["cannot be read as an image", "download it again"]),
+        (lambda root, path: path.write_bytes(b"no image"), ["cannot be read as an image", "get the file again"]),
         (lambda root, path: path.write_bytes(path.read_bytes()[:900]), ["cannot be read as an image"]),
         (lambda root, path: Image.new("L", (640, 480)).save(path), ["mode L", "expected one channel of 16 bits"]),
         (lambda root, path: Image.new("RGB", (640, 480)).save(path), ["mode RGB", "16 bits"]),

@@ -6,10 +6,10 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-from physpose_torch.bop.formats import load_json
 from physpose_torch.config import Calibration
 from physpose_torch.errors import DataError, InvalidInputError
 from physpose_torch.files import write_file
+from physpose_torch.reading import load_json, shown
 
 __all__ = ["read_calibration", "write_calibration"]
 
@@ -50,11 +50,11 @@ def read_calibration(path: str | os.PathLike) -> Calibration:
         values[field] = _number(content.get(name), path, name) * unit
     bounds = content.get("interval") or {}
     if not isinstance(bounds, Mapping):
-        raise DataError(f"{path}: interval is {bounds!r}, expected {{name: [low, high]}}")
+        raise DataError(f"{path}: interval is {shown(bounds)}, expected {{name: [low, high]}}")
     for name, pair in bounds.items():
         if name in _FIELDS:
             if not isinstance(pair, list) or len(pair) != 2:
-                raise DataError(f"{path}: interval of {name} is {pair!r}, expected [low, high]")
+                raise DataError(f"{path}: interval of {name} is {shown(pair)}, expected [low, high]")
             field, unit = _FIELDS[name]
             interval[field] = tuple(_number(x, path, f"interval of {name}") * unit for x in pair)
     try:
@@ -65,5 +65,5 @@ def read_calibration(path: str | os.PathLike) -> Calibration:
 
 def _number(value: Any, path: str | os.PathLike, name: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:
-        raise DataError(f"{path}: {name} is {value!r}, expected a finite number; make it with physpose calibrate")
+        raise DataError(f"{path}: {name} is {shown(value)}, expected a finite number; make it with physpose calibrate")
     return float(value)

@@ -3,7 +3,6 @@
 Everything is read on first use. The files speak millimetres; what is handed out is in metres, float64.
 """
 
-import contextlib
 import logging
 import math
 import os
@@ -17,13 +16,18 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from physpose_torch.bop.formats import Target, load_json, read_targets
+from physpose_torch.bop.formats import MAX_ID, Target, load_json, read_targets
 from physpose_torch.errors import DataError, InvalidInputError, UnknownLabelError
+from physpose_torch.geometry.body import FARTHEST, read_mesh
+from physpose_torch.reading import LONGEST_SIDE, MOST_PIXELS, read_pixels, read_size
 
 __all__ = ["MESH_SCALE", "BopDataset", "Camera", "GroundTruth", "symmetry_transforms"]
 
 MESH_SCALE = 1e-3
 """Factor from the unit of BOP meshes to metres."""
+
+MOST_SYMMETRIES = 1000
+"""Discrete ones times continuous axes."""
 
 _log = logging.getLogger("physpose_torch")
 _MIN_VISIBLE = 0.1  # BOP19 asks only for objects that are visible to 10 %
@@ -162,7 +166,7 @@ class BopDataset:
             DataError: There is no models_info.json, or no diameter of the object in it.
         """
         diameter = self._info(obj_id).get("diameter")
-        if not isinstance(diameter, int | float) or not 0 < diameter < math.inf:
+        if not isinstance(diameter, int | float) or not 0 < diameter < 1e6:
             place = self.eval_models_path / "models_info.json"
             raise DataError(f"{place}: no diameter of object {obj_id}, which MSSD needs; add the file of the dataset")
         return diameter * MESH_SCALE
@@ -176,7 +180,7 @@ class BopDataset:
         key = ("symmetries", obj_id, max_step)
         try:
             return self._once(key, lambda: symmetry_transforms(self._info(obj_id), max_step))
-        except (ValueError, TypeError, KeyError, RuntimeError) as error:
+        except (ValueError, TypeError, KeyError, RuntimeError, OverflowError) as error:
             place = self.eval_models_path / "models_info.json"
             raise DataError(f"{place}, object {obj_id}: broken symmetry ({error}); see BOP's format") from error
 
@@ -208,7 +212,7 @@ class BopDataset:
             raise DataError(f"{place}: no such image; there are {_some(cameras)}")
         entry = cameras[im_id]
         K = _array(entry, "cam_K", 9, place).reshape(3, 3)
-        if not (K[0, 0] > 0 and K[1, 1] > 0 and K[2, 2] == 1):
+        if not (K[0, 0] > 0 and K[1, 1] > 0 and K[2, 2] == 1 and np.abs(K).max() < 1e6):
             raise DataError(f"{place}: cam_K is {K.tolist()}, expected a pinhole camera, 3×3 row-major")
         scale = None
         if entry.get("depth_scale") is not None:
@@ -273,23 +277,17 @@ class BopDataset:
             DataError: The file is missing, unreadable, of 8 bits, or not of the size of the colour image; or
                 scene_camera.json has no depth_scale.
         """
-        from PIL import Image
-
         path = self.image_path(scene_id, im_id, "depth")
         scale = self.camera(scene_id, im_id).depth_scale
         if scale is None or not scale > 0:
             place = f"{self._scene(scene_id) / 'scene_camera.json'}, image {im_id}"
             raise DataError(f"{place}: no positive 'depth_scale', so {path} has no unit; add it [mm per value]")
-        try:
-            with Image.open(path) as opened:
-                mode, values = opened.mode, np.array(opened)
-        except (OSError, SyntaxError, ValueError) as error:  # SyntaxError: Pillow's word for a broken PNG
-            raise DataError(f"{path}: cannot be read as an image ({error}); download it again") from error
+        mode, values = read_pixels(path)
         if values.ndim != 2 or not mode.startswith(("I", "F")):
             what = f"Pillow's mode {mode}, shape {values.shape}"
             raise DataError(f"{path}: not a depth image ({what}); expected one channel of 16 bits")
         for other in filter(None, (self._image_file(scene_id, im_id, kind) for kind in ("rgb", "gray"))):
-            size = _size(other)
+            size = read_size(other)
             if size and size != values.shape[::-1]:
                 sizes = f"{values.shape[1]}×{values.shape[0]} px, but {other} is {size[0]}×{size[1]} px"
                 raise DataError(f"{path}: {sizes}; K belongs to one of them, bring the depth to the other's view")
@@ -376,6 +374,8 @@ class BopDataset:
 
     def _scene_file(self, scene_id: int, name: str) -> dict[int, Any]:
         path = self._scene(scene_id) / name
+        if path.exists() and not path.is_file():  # a pipe would be waited for at every image
+            raise DataError(f"{path}: is no regular file; download it again")
         return self._once(path, lambda: _ids(load_json(path), path))
 
     def _read_ground_truth(self, scene_id: int) -> GroundTruth:
@@ -393,6 +393,8 @@ class BopDataset:
             for gt_id, (instance, extra) in enumerate(zip(instances, infos, strict=True)):
                 place = f"{path}, image {im_id}, entry {gt_id}"
                 obj_id = _array(instance, "obj_id", 1, place)[0]
+                if not 0 <= obj_id < MAX_ID:
+                    raise DataError(f"{place}: obj_id is {obj_id:g}, expected an id; download the file again")
                 ids.append((im_id, gt_id, int(obj_id)))
                 T = np.eye(4)
                 T[:3, :3] = _array(instance, "cam_R_m2c", 9, place).reshape(3, 3)
@@ -406,19 +408,11 @@ class BopDataset:
 
     def _mesh(self, obj_id: int) -> tuple[torch.Tensor, torch.Tensor]:
         def load() -> tuple[torch.Tensor, torch.Tensor]:
-            import trimesh  # only needed here, and slow to import
-
             path = self.model_path(obj_id, evaluation=True)
-            try:
-                mesh = trimesh.load_mesh(path, process=False)
-                points = np.array(mesh.vertices, dtype=np.float64)
-                faces = np.array(mesh.faces, dtype=np.int64)
-            except Exception as error:
-                raise DataError(f"{path}: cannot be read as a mesh ({error}); download the model again") from error
-            if not len(faces) or not np.isfinite(points).all():  # trimesh gives a point cloud no points at all
-                raise DataError(f"{path}: no faces, or vertices that are not finite; download the model again")
-            if not 0 <= faces.min() <= faces.max() < len(points):
-                raise DataError(f"{path}: faces of vertices that are not there; download the model again")
+            mesh = read_mesh(path, label=path.name)
+            points, faces = np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
+            if not np.abs(points).max() * MESH_SCALE < FARTHEST:  # nor is NaN
+                raise DataError(f"{path}: vertices that are not finite, or farther than {FARTHEST:g} m; download it again")
             return torch.from_numpy(points) * MESH_SCALE, torch.from_numpy(faces)
 
         return self._once(("mesh", obj_id), load)
@@ -432,7 +426,7 @@ class BopDataset:
     def _find_size(self, scene_id: int) -> tuple[int, int]:
         for folder in (self._scene(scene_id), *self._scenes.values()):
             for image in (image for kind in ("rgb", "gray", "depth") for image in sorted((folder / kind).glob("*"))):
-                if image.suffix.lower() in _IMAGES and (size := _size(image)):
+                if image.suffix.lower() in _IMAGES and (size := read_size(image)):
                     return size
             if folder == self._scene(scene_id) and (size := self._camera_file_size()):
                 return size
@@ -452,17 +446,9 @@ class BopDataset:
         sizes = [(camera.get("width"), camera.get("height")) for camera in cameras if isinstance(camera, dict)]
         if not sizes or any(size != sizes[0] for size in sizes):
             return None
-        width, height = (x if isinstance(x, int) and 0 < x < 100_000 else None for x in sizes[0])
-        return (width, height or round(width * 3 / 4)) if width else None
-
-
-def _size(image: Path) -> tuple[int, int] | None:
-    """Width and height of an image file [px], None if it is not one."""
-    from PIL import Image
-
-    with contextlib.suppress(OSError, SyntaxError), Image.open(image) as opened:
-        return opened.size
-    return None
+        width, height = (x if isinstance(x, int) and 0 < x <= LONGEST_SIDE else None for x in sizes[0])
+        size = (width, height or round(width * 3 / 4)) if width else None
+        return size if size and size[0] * size[1] <= MOST_PIXELS else None
 
 
 def symmetry_transforms(info: dict, max_step: float = 0.01) -> torch.Tensor:
@@ -498,6 +484,10 @@ def symmetry_transforms(info: dict, max_step: float = 0.01) -> torch.Tensor:
         T[:, :3, :3] += sin * cross + (1 - cos) * (cross @ cross)
         T[:, :3, 3] = offset - T[:, :3, :3] @ offset
         continuous.append(T)
+    if not all(bool(T.isfinite().all()) for T in (*discrete, *continuous)):
+        raise ValueError("a number is not finite")
+    if len(discrete) * max(len(continuous), 1) > MOST_SYMMETRIES:
+        raise ValueError(f"{len(discrete) - 1} discrete and {len(continuous)} continuous ones are too many")
     if not continuous:
         return torch.stack(discrete)
     return (torch.cat(continuous) @ torch.stack(discrete)[:, None]).flatten(0, 1)

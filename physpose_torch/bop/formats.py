@@ -5,7 +5,6 @@ ids and scores as numpy arrays. What is broken in one row or one image is report
 run over a thousand others; only a file that cannot be read as a whole raises `DataError`.
 """
 
-import json
 import math
 import os
 import re
@@ -19,6 +18,7 @@ import torch
 
 from physpose_torch.errors import DataError, InvalidInputError
 from physpose_torch.files import write_file
+from physpose_torch.reading import inside, load_json, read_text, shown
 
 __all__ = [
     "Estimates",
@@ -43,7 +43,8 @@ _MM = 1e-3
 _ROTATION_TOLERANCE = 1e-2
 _FAR = 100.0  # [m] nothing that a tabletop camera sees is farther away
 _PLANE_NEAR, _PLANE_FAR = 0.01, 20.0  # [m] outside of this a plane's offset has the wrong unit
-_MAX_ID = 10**9
+MAX_ID = 10**9
+"""All ids are smaller."""
 
 
 class RowProblem(NamedTuple):
@@ -163,7 +164,7 @@ def read_estimates(path: str | os.PathLike) -> Estimates:
         BOP challenge 2019, https://bop.felk.cvut.cz/challenges/bop-challenge-2019/.
     """
     path = Path(path)
-    lines = re.findall(r"[^\r\n]*(?:\r\n|\r|\n)|[^\r\n]+", _read_text(path))
+    lines = re.findall(r"[^\r\n]*(?:\r\n|\r|\n)|[^\r\n]+", read_text(path))
     rows, problems, header = parse_rows(path, enumerate(lines, start=1))
     if not rows and not header:
         raise no_result_file(path, problems)
@@ -195,7 +196,7 @@ def parse_rows(
             continue
         if not started and any(field.lower() in ("scene_id", "im_id") for field in fields):
             if tuple(field.lower() for field in fields) != tuple(column.lower() for column in _COLUMNS):
-                raise DataError(f"{path}, line {number}: the header is {line.strip()!r}, expected {','.join(_COLUMNS)}")
+                raise DataError(f"{path}, line {number}: the header is {shown(line.strip())}, expected {','.join(_COLUMNS)}")
             started = header = True
             continue
         started = True
@@ -391,46 +392,12 @@ def read_targets(path: str | os.PathLike) -> list[Target]:
         raise DataError(f"{path}: expected a list of targets, found {type(content).__name__}")
     for index, entry in enumerate(content):
         values = [entry.get(key) if isinstance(entry, dict) else None for key in Target._fields]
-        if not all(type(value) is int and 0 <= value < _MAX_ID for value in values):
-            raise DataError(f"{path}, entry {index}: expected integers {', '.join(Target._fields)}, found {entry}")
+        if not all(type(value) is int and 0 <= value < MAX_ID for value in values):
+            raise DataError(f"{path}, entry {index}: expected integers {', '.join(Target._fields)}, found {shown(entry)}")
         target = Target(*values)
         if targets.setdefault(target[:3], target) is not target:
-            raise DataError(f"{path}, entry {index}: {entry} is listed twice; merge the entries")
+            raise DataError(f"{path}, entry {index}: {shown(entry)} is listed twice; merge the entries")
     return list(targets.values())
-
-
-def load_json(path: str | os.PathLike) -> Any:
-    """Parse a JSON file (UTF-8, byte order mark allowed).
-
-    Raises:
-        DataError: The file is missing, empty, not UTF-8, no JSON, or has a key twice in one object.
-    """
-
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        if len(result := dict(pairs)) < len(pairs):
-            keys = [key for key, _ in pairs]
-            twice = next(key for key in keys if keys.count(key) > 1)
-            raise DataError(f"{path}: key {twice!r} appears twice in one object; keep one of them")
-        return result
-
-    try:
-        return json.loads(_read_text(Path(path)).lstrip("\ufeff"), object_pairs_hook=unique)
-    except DataError:
-        raise
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{path}: no valid JSON: {error}") from None
-
-
-def _read_text(path: Path) -> str:
-    try:
-        text = path.read_bytes().decode()
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); check the path") from None
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: not UTF-8 text (byte {error.start}); save it as UTF-8") from None
-    if not text.strip("\ufeff \t\r\n"):
-        raise DataError(f"{path}: the file is empty")
-    return text
 
 
 def _parse_row(fields: list[str]) -> tuple:
@@ -438,17 +405,17 @@ def _parse_row(fields: list[str]) -> tuple:
         raise ValueError(f"{len(fields)} fields, expected {len(_COLUMNS)} ({','.join(_COLUMNS)})")
     for name, field in zip(_COLUMNS[:3], fields[:3], strict=True):
         if not re.fullmatch(r"[0-9]{1,9}", field):
-            raise ValueError(f"{name} is {field!r}, expected a non-negative integer")
+            raise ValueError(f"{name} is {shown(field)}, expected a non-negative integer")
     numbers = []
     for name, field, count in zip(_COLUMNS[3:], fields[3:], (1, 9, 3, 1), strict=True):
         try:
             values = tuple(map(float, field.split()))
         except ValueError:
-            raise ValueError(f"{name} is {field!r}, expected {count} numbers separated by spaces") from None
+            raise ValueError(f"{name} is {shown(field)}, expected {count} numbers separated by spaces") from None
         if len(values) != count:
             raise ValueError(f"{name} has {len(values)} numbers, expected {count}")
         if not all(map(math.isfinite, values)):
-            raise ValueError(f"{name} is {field!r}, expected finite numbers")
+            raise ValueError(f"{name} is {shown(field)}, expected finite numbers")
         numbers.append(values if count > 1 else values[0])
     return (*map(int, fields[:3]), *numbers)
 
@@ -488,7 +455,7 @@ def _int_keys(content: Any, where: str) -> list[tuple[int, Any]]:
     ids: dict[int, Any] = {}
     for key, value in content.items():
         if not re.fullmatch(r"[0-9]{1,9}", key):
-            raise DataError(f"{where}: key {key!r} is not an id; the form is {{scene: {{image: entry}}}}")
+            raise DataError(f"{where}: key {shown(key)} is not an id; the form is {{scene: {{image: entry}}}}")
         if int(key) in ids:
             raise DataError(f"{where}: id {int(key)} appears twice; keep one of them")
         ids[int(key)] = value
@@ -500,7 +467,7 @@ def _numbers(entry: dict, key: str, count: int) -> list[float]:
     rows = [value] if count == 1 else value if isinstance(value, list) else []
     flat = [x for row in rows for x in (row if count == 9 and isinstance(row, list) else [row])]
     if len(flat) != count or not all(type(x) in (int, float) and abs(x) < 1e15 for x in flat):
-        raise ValueError(f"{key!r} is {value}, expected {count} finite number{'s' * (count > 1)}")
+        raise ValueError(f"{key!r} is {shown(value)}, expected {count} finite number{'s' * (count > 1)}")
     return [float(x) for x in flat]
 
 
@@ -541,17 +508,18 @@ def _static(entry: Any, folder: Path, label: str) -> StaticRecord:
         raise ValueError('expected {"mesh" or "box_mm", "poses"}')
     mesh, box, scale = None, None, 1.0
     if "mesh" in entry:
-        mesh = (folder / str(entry["mesh"])).resolve()
-        if not mesh.is_relative_to(folder.resolve()):
-            raise ValueError(f"mesh {entry['mesh']!r} leaves the folder {folder}; put the mesh next to the JSON file")
+        mesh = inside(folder, str(entry["mesh"]))
         if not mesh.is_file():
-            raise ValueError(f"mesh {entry['mesh']!r} is not in {folder}; put it there")
+            raise ValueError(f"mesh {shown(entry['mesh'])} is not in {folder}; put it there")
         scale, label = _numbers({"scale": _MM, **entry}, "scale", 1)[0], mesh.stem
     else:
         box = tuple(side * _MM for side in _numbers(entry, "box_mm", 3))
     if scale <= 0 or (box and min(box) <= 0):
         raise ValueError("scale and box_mm must be positive")
-    return StaticRecord(str(entry.get("label", label)), mesh, scale, box, dict(_static_poses(entry.get("poses"))))
+    label = entry.get("label", label)
+    if not isinstance(label, str) or not label.isprintable():
+        raise ValueError(f"label is {shown(label)}, expected a name")
+    return StaticRecord(label, mesh, scale, box, dict(_static_poses(entry.get("poses"))))
 
 
 def _static_poses(content: Any) -> Iterator[tuple[tuple[int | None, int | None], torch.Tensor]]:
@@ -561,7 +529,7 @@ def _static_poses(content: Any) -> Iterator[tuple[tuple[int | None, int | None],
         images = {"all": images} if scene == "all" else images
         for image, pose in images.items() if isinstance(images, dict) else [("", images)]:
             if not all(re.fullmatch(r"all|[0-9]{1,9}", name) for name in (scene, image)) or not isinstance(pose, dict):
-                where = f"{scene!r}: {image!r}: ..." if image else f"{scene!r}: {images!r}"
+                where = f"{shown(scene)}: {shown(image)}: ..." if image else f"{scene!r}: {shown(images)}"
                 raise ValueError(f'poses, {where}: expected {{"all": pose}} or {{scene: {{image or "all": pose}}}}')
             T = torch.eye(4, dtype=torch.float64)
             try:

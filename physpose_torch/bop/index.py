@@ -3,8 +3,6 @@
 import hashlib
 import os
 import re
-import shutil
-import tempfile
 from array import array
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -14,11 +12,13 @@ import numpy as np
 
 from physpose_torch.bop.formats import Estimates, make_estimates, no_result_file, parse_rows, refuse_metres
 from physpose_torch.errors import DataError
+from physpose_torch.reading import opened
 
 __all__ = ["EstimatesIndex"]
 
 _BLOCK = 1 << 18  # bytes read at a time
 _LINE = re.compile(rb"[^\r\n]*(?:\r\n|\r|\n)|[^\r\n]+")
+_LONGEST = 16_000_000  # bytes of a line
 _IDS = 10**9  # more than any id
 _NOBODY = -1  # whose lines without scene and image are
 
@@ -116,7 +116,7 @@ class EstimatesIndex:
         Raises:
             DataError: the file was changed since the index was made.
         """
-        for lines in _blocks(self._file):
+        for lines in _blocks(self._file, self.path):
             self._check()
             yield from lines
 
@@ -125,7 +125,7 @@ class EstimatesIndex:
         shallow, deep = array("d"), 0
         self.unplaced, digest = [], hashlib.sha256()
         blank, result_file, bad = True, False, []  # bad: the first one
-        for block in _blocks(self._file):
+        for block in _blocks(self._file, self.path):
             text = []
             for line in block:
                 try:
@@ -196,24 +196,19 @@ def _by_appearance(key: np.ndarray) -> np.ndarray:
 
 def _opened(path: Path) -> BinaryIO:
     try:
-        file = open(path, "rb")  # noqa: SIM115
-        if file.seekable():
-            return file
-        with file:
-            copy = tempfile.TemporaryFile()  # noqa: SIM115
-            shutil.copyfileobj(file, copy)
-            copy.flush()
-            return copy
+        return opened(path)
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); check the path") from None
 
 
-def _blocks(file: BinaryIO) -> Iterator[list[bytes]]:
+def _blocks(file: BinaryIO, path: Path) -> Iterator[list[bytes]]:
     """The lines of a file, line ends included, a few hundred kilobytes at a time."""
     file.seek(0)
     rest, at = b"", 0
     while block := file.read(max(_BLOCK, len(rest))):
         block = rest + block
+        if len(rest) > _LONGEST:
+            raise DataError(f"{path}: a line of more than {_LONGEST // 1_000_000} MB; is this a result file?")
         cut = max(block.rfind(b"\n"), block.rfind(b"\r", 0, -1)) + 1  # a \r at the end may be half of a \r\n
         at, rest = file.tell(), block[cut:]
         yield _LINE.findall(block[:cut])

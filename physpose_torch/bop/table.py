@@ -13,10 +13,11 @@ from torch import Tensor
 
 from physpose_torch import se3
 from physpose_torch.bop.dataset import BopDataset
-from physpose_torch.bop.formats import Estimates, load_json
+from physpose_torch.bop.formats import MAX_ID, Estimates, load_json
 from physpose_torch.errors import DataError, PhysPoseError, UnknownLabelError
 from physpose_torch.files import write_file
 from physpose_torch.geometry.body import Body, Plane
+from physpose_torch.reading import inside, read_pixels, shown
 from physpose_torch.scene import Scene
 from physpose_torch.table.estimator import TableEstimate, TableEstimator
 from physpose_torch.table.view import View
@@ -26,8 +27,6 @@ __all__ = ["Pair", "TableScene", "TablesOnTheWay", "load_models", "read_image", 
 MM = 1e-3
 MESHES = (".ply", ".glb", ".gltf", ".obj", ".stl", ".off")
 """Endings of meshes, in the order of preference."""
-MOST_PIXELS = 200_000_000
-"""A file that claims to be larger than this is not opened."""
 
 
 class TableScene(NamedTuple):
@@ -65,7 +64,7 @@ def read_scene(path: str | Path) -> TableScene:
     obj_ids, poses = [], ([], [])
     for i, entry in enumerate(content["objects"]):
         where = f"{path}, objects[{i}]"
-        if not isinstance(entry, dict) or type(entry.get("obj_id")) is not int:
+        if not isinstance(entry, dict) or type(entry.get("obj_id")) is not int or not 0 <= entry["obj_id"] < MAX_ID:
             raise DataError(f"{where}: expected an object with an integer obj_id")
         obj_ids.append(entry["obj_id"])
         for view, column in enumerate(poses):
@@ -117,17 +116,10 @@ def read_image(path: str | Path) -> Tensor:
     Raises:
         DataError: it is missing, no image, or broken.
     """
-    from PIL import Image
-
-    try:
-        with Image.open(path) as opened:
-            if opened.width * opened.height > MOST_PIXELS:
-                raise DataError(f"{path}: {opened.width} x {opened.height} px is no photograph")
-            return torch.from_numpy(np.array(opened.convert("RGB")))
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such image") from None
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise DataError(f"{path}: cannot be read as an image ({error})") from None
+    mode, pixels = read_pixels(path)
+    if pixels.ndim != 3:
+        raise DataError(f"{path}: has 16 bits or more a pixel (Pillow's mode {mode}); expected a photograph of 8 bits")
+    return torch.from_numpy(pixels)
 
 
 def table_entry(estimate: TableEstimate) -> dict[str, Any]:
@@ -173,28 +165,26 @@ def read_pairs(path: str | Path) -> dict[tuple[int, int], Pair]:
             if not isinstance(entry, dict):
                 raise DataError(f'{where}: expected {{"second": image, "files": [first, second]}}')
             second, files = entry.get("second"), entry.get("files") or []
-            if second is not None and (type(second) is not int or second < 0):
-                raise DataError(f"{where}: second is {second!r}, expected an image id or null")
+            if second is not None and (type(second) is not int or not 0 <= second < MAX_ID):
+                raise DataError(f"{where}: second is {shown(second)}, expected an image id or null")
             if not isinstance(files, list) or len(files) > 2 or not all(isinstance(f, str) for f in files):
-                raise DataError(f"{where}: files is {files!r}, expected one or two file names")
-            inside = []
-            for name in files:
-                file = (path.parent / name).resolve()
-                if not file.is_relative_to(path.parent.resolve()):
-                    raise DataError(f"{where}: {name!r} leaves the folder {path.parent}; put the image next to the JSON file")
-                inside.append(file)
-            pairs[scene, image] = Pair(second, (*inside, None, None)[:2], _direction(entry.get("gravity"), where))
+                raise DataError(f"{where}: files is {shown(files)}, expected one or two file names")
+            try:
+                found = [inside(path.parent, name) for name in files]
+            except ValueError as error:
+                raise DataError(f"{where}: {error}") from None
+            pairs[scene, image] = Pair(second, (*found, None, None)[:2], _direction(entry.get("gravity"), where))
     return pairs
 
 
 def _direction(value: Any, where: str) -> Tensor | None:
     if value is None:
         return None
-    numbers = isinstance(value, list) and len(value) == 3 and all(type(x) in (int, float) for x in value)
+    numbers = isinstance(value, list) and len(value) == 3 and all(type(x) in (int, float) and abs(x) < 1e9 for x in value)
     gravity = torch.tensor(value if numbers else [0.0] * 3, dtype=torch.float64)
     length = torch.linalg.vector_norm(gravity)
     if not 0 < float(length) < math.inf:
-        raise DataError(f"{where}: gravity is {value!r}, expected three numbers that point down in the camera frame")
+        raise DataError(f"{where}: gravity is {shown(value)}, expected three numbers that point down in the camera frame")
     return gravity / length
 
 
@@ -269,7 +259,7 @@ class TablesOnTheWay:
 def _matrix(value: Any, size: int, where: str) -> Tensor:
     try:
         array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.empty(0)
     if array.shape != (size, size) or not np.isfinite(array).all():
         raise DataError(f"{where} is not a {size}x{size} matrix of finite numbers")

@@ -116,6 +116,8 @@ class Ablate(ImageOptions):
             write_file(self.json, json.dumps(content, indent=2, allow_nan=False) + "\n")
         if not self.quiet:
             print("", *self._notes(part, len(looked_at), count, skipped), sep="\n")
+        elif not failures:
+            problems += [f"{row.variant.name}: {row.error}" for row in rows if row.error]
         for problem in problems:
             logger.error(problem)
         return 1 if problems or failed else 0

@@ -13,6 +13,7 @@ import tyro
 
 from physpose_torch.bop.dataset import BopDataset
 from physpose_torch.bop.scenes import ImageScene, poses_of
+from physpose_torch.bop.table import read_image
 from physpose_torch.commands.common import progress
 from physpose_torch.commands.images import ImageOptions, Images
 from physpose_torch.config import RefinerConfig
@@ -165,18 +166,15 @@ def _camera(
     dataset: BopDataset, scene_id: int, im_id: int
 ) -> tuple[torch.Tensor | None, tuple[int, int] | None, np.ndarray | None]:
     """Intrinsics, size and image, as far as the dataset has them."""
-    from PIL import Image
-
     try:
         K = dataset.camera(scene_id, im_id).K
     except PhysPoseError:
         return None, None, None
     try:
         if dataset.has_image(scene_id, im_id):
-            with Image.open(dataset.image_path(scene_id, im_id)) as file:
-                picture = np.asarray(file.convert("RGB"))
+            picture = read_image(dataset.image_path(scene_id, im_id)).numpy()
             return K, picture.shape[:2], picture
         width, height = dataset.image_size(scene_id)
         return K, (height, width), None
-    except (PhysPoseError, OSError):
+    except PhysPoseError:
         return K, None, None

@@ -1,5 +1,6 @@
 """What a scene is made of: rigid bodies with convex parts, and planes."""
 
+import contextlib
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -8,13 +9,15 @@ import numpy as np
 import torch
 import trimesh
 from torch import Tensor
+from trimesh.resolvers import FilePathResolver
 
 from physpose_torch import se3
 from physpose_torch.errors import DataError, InvalidInputError
 from physpose_torch.geometry.convex import ConvexParts
 from physpose_torch.geometry.decompose import DecomposeOptions, DecomposeReport, decompose
+from physpose_torch.reading import inside
 
-__all__ = ["Body", "Plane", "is_flat", "load_mesh"]
+__all__ = ["FARTHEST", "Body", "Plane", "is_flat", "load_mesh", "read_mesh"]
 
 CYLINDER_SIDES = 32
 LARGEST = 10.0
@@ -23,6 +26,9 @@ HOUSEHOLD = 0.25
 """[m]; what is larger than ``LARGEST`` is cut into parts as finely as an object of this size."""
 FARTHEST = 1e6
 """[m]; no mesh has vertices beyond this."""
+ARCHIVES = (".zip", ".gz", ".bz2", ".zae", ".3mf", ".3dxml")
+LARGEST_FILE = 2_000_000_000
+"""[bytes]; of a mesh file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +75,7 @@ class Body:
             DataError: the file is missing or cannot be read, or the mesh has no faces, NaN, or no volume.
             InvalidInputError: it is smaller than 1 mm, or larger than 10 m without a scale; an option is unknown.
         """
-        raw = _read_mesh(mesh, label)
+        raw = read_mesh(mesh, label)
         believed, scale = scale is not None, 1.0 if scale is None else scale
         mesh = load_mesh(raw, label=label, scale=scale)
         try:
@@ -95,7 +101,7 @@ class Body:
         Raises:
             DataError: the file is missing or cannot be read, or the mesh has no faces, NaN, or no volume.
         """
-        raw = _read_mesh(mesh, label)
+        raw = read_mesh(mesh, label)
         mesh = load_mesh(raw, label=label, scale=scale)
         if is_flat(mesh):
             raise DataError(f"{label}: the mesh is flat; a body needs a volume")
@@ -204,7 +210,7 @@ def load_mesh(mesh: trimesh.Trimesh | str | Path, *, label: str, scale: float = 
     """
     if not (np.isfinite(scale) and scale > 0):
         raise InvalidInputError(f"{label}: scale = {scale}, expected a positive factor to metres (0.001 for mm)")
-    mesh = _read_mesh(mesh, label)
+    mesh = read_mesh(mesh, label)
     vertices, faces = np.asarray(mesh.vertices, dtype=np.float64) * scale, np.asarray(mesh.faces)
     if not np.isfinite(vertices).all():
         raise DataError(f"{label}: the mesh has NaN or infinite vertices")
@@ -217,14 +223,23 @@ def load_mesh(mesh: trimesh.Trimesh | str | Path, *, label: str, scale: float = 
     return out
 
 
-def _read_mesh(mesh: trimesh.Trimesh | str | Path, label: str) -> trimesh.Trimesh:
-    """The mesh as it is in the file, or as it was given."""
+def read_mesh(mesh: trimesh.Trimesh | str | Path, label: str) -> trimesh.Trimesh:
+    """The mesh as it is in the file, or as it was given. What a file refers to (materials, textures, buffers) is looked for in
+    its folder only.
+
+    Raises:
+        DataError: the file is missing, an archive, larger than 2 GB or cannot be read, or holds no triangles.
+    """
     if isinstance(mesh, str | Path):
         path = Path(mesh)
         if not path.is_file():
             raise DataError(f"{label}: no mesh file {path}")
+        if path.suffix.lower() in ARCHIVES:  # a few bytes can become gigabytes
+            raise DataError(f"{label}: {path} is an archive; unpack it, and name the mesh in it")
+        if (size := path.stat().st_size) > LARGEST_FILE:
+            raise DataError(f"{label}: {path} has {size / 1e9:.1f} GB; simplify the mesh, or is it the right file?")
         try:
-            mesh = trimesh.load_mesh(path, process=False)
+            mesh = trimesh.load_mesh(path, process=False, resolver=_Beside(str(path)))
         except Exception as error:  # whatever the many file readers raise
             raise DataError(f"{label}: cannot read {path} as a mesh ({type(error).__name__}: {error})") from error
     if isinstance(mesh, trimesh.Scene):
@@ -243,6 +258,18 @@ def _read_mesh(mesh: trimesh.Trimesh | str | Path, label: str) -> trimesh.Trimes
         wrong = int(faces.min()) if faces.min() < 0 else int(faces.max())
         raise DataError(f"{label}: a face names vertex {wrong}, but the mesh has {len(vertices)}; the file is damaged")
     return mesh
+
+
+class _Beside(FilePathResolver):
+    """What a mesh file refers to: files in its folder, and no pipes; a path that is not there may be so by its last name."""
+
+    def get(self, name: str) -> bytes:
+        for candidate in (name.strip(), Path(name).name):
+            with contextlib.suppress(ValueError):
+                path = inside(Path(self.parent), candidate)
+                if path.is_file():
+                    return path.read_bytes()
+        raise FileNotFoundError(f"{name} is not in {self.parent}")
 
 
 def _appearance(mesh: trimesh.Trimesh, scale: float) -> trimesh.Trimesh | None:

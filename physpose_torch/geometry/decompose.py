@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 import warnings
+import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
@@ -34,6 +35,7 @@ __all__ = ["DecomposeOptions", "DecomposeReport", "Decomposition", "decompose", 
 logger = logging.getLogger("physpose_torch")
 
 ALGORITHM_VERSION = 3  # part of the cache key: raise it whenever results change
+_LARGEST = 100_000_000  # bytes that a cache file may unpack to
 FINENESS = (3.0, 2.0)  # CoACD's concavity thresholds to try, in tolerances
 _warned: set[bytes] = set()  # meshes whose fallback has been reported
 _unwritable: set[Path | None] = set()  # cache folders of which that has been reported
@@ -290,6 +292,9 @@ def _cache_path(mesh: trimesh.Trimesh, options: DecomposeOptions) -> Path | None
 
 def _load(path: Path) -> Decomposition | None:
     try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > _LARGEST:
+                raise ValueError("too large")
         with np.load(path, allow_pickle=False) as data:
             if torn := data.zip.testzip():
                 raise DataError(f"{torn} is damaged")
@@ -306,7 +311,7 @@ def _load(path: Path) -> Decomposition | None:
 
 
 def _sound(hull: np.ndarray) -> bool:
-    return hull.dtype == np.float64 and hull.shape == (len(hull), 3) and len(hull) > 3 and bool(np.isfinite(hull).all())
+    return hull.dtype == np.float64 and hull.shape == (len(hull), 3) and len(hull) > 3 and bool((np.abs(hull) < 1e3).all())
 
 
 def _store(path: Path, result: Decomposition) -> None:

@@ -71,7 +71,8 @@ def few_vertices(points: np.ndarray, max_vertices: int, tolerance: float) -> np.
     directions = np.stack([ring * np.cos(turn), ring * np.sin(turn), height], 1)
     directions = np.concatenate([directions, np.eye(3), -np.eye(3)])
     weight = np.concatenate([np.ones(2000), np.full(6, 20.0)])
-    target, moved = (directions @ points.T).max(1), vertices
+    chunks = np.array_split(points, len(points) // 10_000 + 1)  # gigabytes, if a million points were asked at once
+    target, moved = np.max([(directions @ chunk.T).max(1) for chunk in chunks], axis=0), vertices
     for _ in range(5):
         heights = directions @ moved.T
         owner, miss = heights.argmax(1), target - heights.max(1)

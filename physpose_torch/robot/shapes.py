@@ -1,5 +1,6 @@
 """A link's collision shapes as one body of convex parts, in the link frame."""
 
+import contextlib
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,6 +13,7 @@ import trimesh
 from physpose_torch.errors import DataError, InvalidInputError
 from physpose_torch.geometry.body import Body, load_mesh
 from physpose_torch.geometry.convex import ConvexParts
+from physpose_torch.reading import shown
 from physpose_torch.robot.urdf import Collision, RobotModel
 
 __all__ = ["Meshes", "find_mesh", "link_body"]
@@ -116,7 +118,8 @@ def find_mesh(filename: str, urdf: Path, packages: Mapping[str, str | Path] | No
     else:
         tried = [folder / filename]
     for path in tried:
-        if path.is_file():
-            return path
+        with contextlib.suppress(OSError):  # a name that is too long
+            if path.is_file():
+                return path
     hint = "; packages={'name': folder} tells where a package is" if filename.startswith("package://") else ""
-    raise DataError(f"{prefix}no mesh {filename}, looked for {', '.join(map(str, tried))}{hint}")
+    raise DataError(f"{prefix}no mesh {shown(filename)}, looked for {', '.join(shown(str(p)) for p in tried)}{hint}")

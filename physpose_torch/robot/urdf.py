@@ -17,6 +17,7 @@ from torch import Tensor
 
 from physpose_torch import se3
 from physpose_torch.errors import DataError
+from physpose_torch.reading import opened
 
 __all__ = ["Collision", "Joint", "Mimic", "RobotModel", "read_urdf"]
 
@@ -91,7 +92,8 @@ def read_urdf(path: str | Path) -> RobotModel:
     """
     path = Path(path)
     try:
-        text = path.read_bytes()
+        with opened(path) as file:
+            text = file.read()
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); expected a URDF file") from error
     _refuse_entities(text, path)

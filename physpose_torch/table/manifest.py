@@ -1,13 +1,13 @@
 """The manifest by which a user names ONNX models of their own; models/README.md describes the format."""
 
 import hashlib
-import json
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from physpose_torch.errors import DataError
+from physpose_torch.reading import inside, load_json, shown
 
 __all__ = ["ROLES", "ModelRecord", "read_manifest"]
 
@@ -63,16 +63,24 @@ class ModelRecord:
     """A detector's scores want a sigmoid."""
 
 
+LARGEST_SIDE = 16_384
+"""[px]; of what a graph wants."""
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) < 1e9  # NaN is not
+
+
 _NAMES = (
     lambda v: isinstance(v, dict) and all(isinstance(n, str) for n in v.values()),
     "an object of our name: tensor name",
 )
 _NUMBERS = (
-    lambda v: isinstance(v, list) and len(v) in (1, 3) and all(isinstance(a, (int, float)) for a in v),
+    lambda v: isinstance(v, list) and len(v) in (1, 3) and all(map(_is_number, v)),
     "1 or 3 numbers",
 )
 _TEXT = (lambda v: isinstance(v, str) and v != "", "a string")
-_WHOLE = (lambda v: type(v) is int and v > 0, "a positive integer")
+_WHOLE = (lambda v: type(v) is int and 0 < v <= LARGEST_SIDE, f"an integer from 1 to {LARGEST_SIDE}")
 _EXPECTED: dict[str, tuple[Callable[[Any], bool], str]] = {
     **dict.fromkeys(["name", "file", "sha256", "source", "licence", "prompt"], _TEXT),
     "role": (lambda v: isinstance(v, str) and v in ROLES, " or ".join(ROLES)),
@@ -84,10 +92,10 @@ _EXPECTED: dict[str, tuple[Callable[[Any], bool], str]] = {
     "mean": _NUMBERS,
     "std": (lambda v: _NUMBERS[0](v) and 0 not in v, f"{_NUMBERS[1]} but 0"),
     "channels": (lambda v: v in (1, 3), "1 (grey) or 3 (RGB)"),
-    "threshold": (lambda v: isinstance(v, (int, float)), "a number"),
+    "threshold": (_is_number, "a number"),
     "normalised": (lambda v: isinstance(v, bool), "true or false"),
     "logits": (lambda v: isinstance(v, bool), "true or false"),
-    "input_ids": (lambda v: isinstance(v, list) and all(type(i) is int for i in v), "a list of integers"),
+    "input_ids": (lambda v: isinstance(v, list) and all(type(i) is int and abs(i) < 2**63 for i in v), "a list of integers"),
     "box_format": (lambda v: v in ("corners", "centre"), '"corners" or "centre"'),
 }
 
@@ -100,10 +108,7 @@ def read_manifest(path: str | Path) -> list[ModelRecord]:
             folder or has another checksum.
     """
     path = Path(path)
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path} cannot be read as JSON: {error}; models/README.md has an example") from error
+    content = load_json(path)
     entries = content.get("models") if isinstance(content, dict) else None
     if not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries):
         raise DataError(f'{path}: expected {{"models": [{{...}}, ...]}}; models/README.md has an example')
@@ -124,7 +129,7 @@ def _read_entry(entry: dict[str, Any], where: str, folder: Path) -> ModelRecord:
     for key, value in given.items():
         holds, expected = _EXPECTED[key]
         if not holds(value):
-            raise DataError(f"{where}: {key} = {value!r}, expected {expected}")
+            raise DataError(f"{where}: {key} = {shown(value)}, expected {expected}")
     if wrong := [key for key in ("mean", "std") if len(given.get(key, [0])) not in (1, given.get("channels", 3))]:
         raise DataError(f"{where}: {wrong[0]} has 3 numbers, but channels = 1; give one")
     role = given["role"]
@@ -133,9 +138,10 @@ def _read_entry(entry: dict[str, Any], where: str, folder: Path) -> ModelRecord:
             raise DataError(f"{where}: {kind} lack {missing}; a model in the role {role} has {sorted(must)}")
         if role != "part" and (unknown := sorted(set(given[kind]) - must - OPTIONAL.get(role, set()))):
             raise DataError(f"{where}: {kind} name {unknown}, unknown to the role {role}; expected {sorted(must)}")
-    file = (folder / given["file"]).resolve()
-    if not file.is_relative_to(folder):
-        raise DataError(f"{where}: file = {given['file']!r} leaves the manifest's folder {folder}; put the file there")
+    try:
+        file = inside(folder, given["file"])
+    except ValueError as error:
+        raise DataError(f"{where}: file = {error}") from None
     if not file.is_file():
         raise DataError(f"{where}: {file} does not exist; correct file, or put the model there")
     if "sha256" in given:

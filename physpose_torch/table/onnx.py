@@ -76,7 +76,9 @@ class Graph:
         able = onnxruntime.get_available_providers()
         wanted = ["CUDAExecutionProvider"] if device == "cuda" and "CUDAExecutionProvider" in able else []
         try:
-            session = onnxruntime.InferenceSession(str(self.record.file), options, [*wanted, "CPUExecutionProvider"])
+            providers = [*wanted, "CPUExecutionProvider"]
+            # it would print, and try the same again
+            session = onnxruntime.InferenceSession(str(self.record.file), options, providers, enable_fallback=0)
         except Exception as error:
             raise DataError(f"{self.record.file} is no ONNX model that can be run: {error}; export it anew") from error
         nodes = {"inputs": session.get_inputs(), "outputs": session.get_outputs()}
@@ -138,7 +140,13 @@ class _Model:
 
     def _scores(self, outputs: dict[str, Tensor], like: Tensor) -> Tensor:
         """(K,), one for each row of `like`; ones where the graph has none."""
-        return self._shaped(outputs, "scores", len(like)) if "scores" in outputs else like.new_ones(len(like)).float()
+        ones = like.new_ones(len(like)).float()
+        return self._shaped(outputs, "scores", len(like)).float() if "scores" in outputs else ones
+
+    def _kept(self, scores: Tensor, *columns: Tensor) -> Tensor:
+        """Which rows are good enough, and have no NaN or infinity, nor have the columns (K, D) beside them."""
+        finite = torch.cat([scores[:, None], *columns], 1).isfinite().all(1)
+        return (scores >= self.record.threshold) & finite
 
 
 class _Extractor(_Model):
@@ -148,9 +156,9 @@ class _Extractor(_Model):
         x, size = self._prepare(image)
         outputs = self._graph(image=x)
         points = self._shaped(outputs, "keypoints", None, 2)
-        descriptors = normalize(self._shaped(outputs, "descriptors", len(points), None), dim=1)
+        descriptors = normalize(self._shaped(outputs, "descriptors", len(points), None).float(), dim=1)
         scores = self._scores(outputs, points)
-        keep = scores >= self.record.threshold
+        keep = self._kept(scores, points, descriptors)
         scale = (image.shape[0] * image.shape[1] / (size[0] * size[1])) ** 0.5
         points = to_image(points[keep], size, image)
         return Features(points, descriptors[keep], scores[keep], torch.full_like(scores[keep], scale))
@@ -198,7 +206,7 @@ class _PairMatcher(_Model):
         points_0 = self._shaped(outputs, "points_0", None, 2)
         points_1 = self._shaped(outputs, "points_1", len(points_0), 2)
         scores = self._scores(outputs, points_0).double()
-        keep = scores >= self.record.threshold
+        keep = self._kept(scores, points_0, points_1)
         points = to_image(points_0[keep], size_0, image_0), to_image(points_1[keep], size_1, image_1)
         return Matches(*points, scores[keep].clamp(0, 1))
 
@@ -214,7 +222,7 @@ class _Reconstructor(_Model):
         for k, image in enumerate((image_0, image_1)):
             points = self._shaped(outputs, f"points_{k}", None, None, 3)
             confidence = self._shaped(outputs, f"confidence_{k}", *points.shape[:2])
-            both = torch.cat([points, confidence[..., None]], 2).permute(2, 0, 1)[None]
+            both = torch.cat([points, confidence[..., None]], 2).float().permute(2, 0, 1)[None]
             both = interpolate(both, tuple(image.shape[:2]), mode="bilinear")[0].permute(1, 2, 0)
             maps |= {f"points_{k}": both[..., :3], f"confidence_{k}": both[..., 3]}
         return PointMaps(**maps)
@@ -248,7 +256,7 @@ class _Detector(_Model):
             corners = torch.stack([centre - half, centre + half], 1) * corners.new_tensor(size) - 0.5
         corners = to_image(corners, size, image).view(-1, 4)
         best = scores.argsort(descending=True, stable=True)
-        best = best[scores[best] >= record.threshold]
+        best = best[self._kept(scores, corners)[best]]
         return Boxes(corners[best], scores[best])
 
 

@@ -285,7 +285,7 @@ def test_broken_symmetries_are_named_with_the_object(bop_folder, broken):
 
 def test_an_unreadable_mesh_is_named(bop_folder):
     (bop_folder / "models" / "obj_000004.ply").write_text("no mesh")
-    with pytest.raises(DataError, match=r"obj_000004.ply: cannot be read as a mesh"):
+    with pytest.raises(DataError, match=r"cannot read .*obj_000004.ply as a mesh"):
         BopDataset(bop_folder).vertices(4)
 
 

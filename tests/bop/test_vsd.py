@@ -393,7 +393,7 @@ def test_instances_are_matched_by_vsd_greedily(folder, write_csv):
 
 def test_a_mesh_without_faces_is_named(folder, write_csv):
     trimesh.PointCloud(np.random.default_rng(0).normal(size=(9, 3))).export(folder / "models" / "obj_000004.ply")
-    with pytest.raises(DataError, match=r"obj_000004.ply: no faces"):
+    with pytest.raises(DataError, match=r"obj_000004.ply: the mesh has no faces"):
         evaluate(truth_csv(write_csv), BopDataset(folder), vsd_depth="rendered")
 
 

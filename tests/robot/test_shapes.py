@@ -114,7 +114,7 @@ def test_a_package_around_the_urdf_is_found(tmp_path):
 @pytest.mark.parametrize(
     ("geometry", "error", "message"),
     [
-        ('<mesh filename="none.stl"/>', DataError, "link 'a', collision 0: no mesh none.stl, looked for"),
+        ('<mesh filename="none.stl"/>', DataError, "link 'a', collision 0: no mesh 'none.stl', looked for"),
         ('<mesh filename="package://p/none.stl"/>', DataError, "packages={'name': folder}"),
         ('<mesh filename="https://a.b/c.stl"/>', DataError, "not a local file"),
         ('<mesh filename="robot.urdf"/>', DataError, "cannot read"),

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from bop_files import HEADER, OFFSET_MM, UP, csv_row, standing, write_models, write_scene
+from corpus_dataset import png
 from PIL import Image
 
 from physpose_torch.__main__ import main
@@ -71,6 +72,26 @@ def test_what_cannot_be_shown_says_why(dataset):
     bad = opened(dataset)[1]
     assert len(bad.scene) == 0
     assert "77" in bad.table(0)
+
+
+@pytest.mark.parametrize(
+    "picture", [b"no image", png(60_000, 60_000), png(640, 480, data=bytes(9)), None], ids=["text", "bomb", "cut", "pipe"]
+)
+def test_a_broken_picture_is_left_out_and_the_objects_are_shown(dataset, picture):
+    path = dataset / "test" / "000002" / "rgb" / "000003.png"
+    path.unlink()
+    os.mkfifo(path) if picture is None else path.write_bytes(picture)
+    first = opened(dataset)[0]
+    assert first.image is None
+    assert first.last > 5
+
+
+@pytest.mark.parametrize("camera", ["{}", "[]", '{"3": {"cam_K": [1e999]}}', '{"3": null}'])
+def test_without_a_camera_the_objects_are_shown(dataset, camera):
+    (dataset / "test" / "000002" / "scene_camera.json").write_text(camera)
+    first = opened(dataset)[0]
+    assert (first.K, first.image) == (None, None)
+    assert first.last > 5
 
 
 @pytest.mark.parametrize(
