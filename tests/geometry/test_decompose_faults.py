@@ -172,7 +172,7 @@ def test_killed_while_an_entry_is_written_nothing_of_it_is_read_and_an_hour_late
     assert [Path(name).suffix for name in files(folder)] == [".npz", ".npz"]
 
 
-def test_the_child_of_a_killed_process_ends_by_itself(monkeypatch):
+def test_the_child_of_a_killed_process_ends_by_itself(cache, monkeypatch):
     hang = module._CHILD.replace("import coacd, numpy", "time.sleep(60)")
     monkeypatch.setattr(module, "_child_command", [sys.executable, "-P", "-c", hang])
     with forked(lambda: decompose(l_shape()).report.n_parts) as pid:

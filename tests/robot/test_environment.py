@@ -387,7 +387,7 @@ def test_a_hand_eye_transform_for_another_number_of_images_is_named(two):
 
 
 def test_the_demo_arm_needs_a_folder(tmp_path):
-    with pytest.raises(DataError, match="folder that exists"):
+    with pytest.raises(DataError, match="cannot be written"):
         demo_arm(tmp_path / "none" / "arm.urdf")
 
 
