@@ -150,7 +150,7 @@ def test_failing_child_falls_back_to_the_hull_and_is_not_cached(monkeypatch, cac
     assert_sound(hulls)
     assert not list(cache_folder.rglob("*.npz"))
     monkeypatch.undo()
-    os.environ["PHYSPOSE_CACHE"] = str(cache_folder.parent)
+    monkeypatch.setenv("PHYSPOSE_CACHE", str(cache_folder.parent))
     assert decompose(l_shape()).report.method == "coacd"
 
 
