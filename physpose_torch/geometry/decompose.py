@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import json
@@ -19,7 +20,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from numbers import Integral, Real
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import fast_simplification
 import numpy as np
@@ -161,14 +162,15 @@ def _ask_child(vertices, faces, *, deadline: float, stop: threading.Event, **set
         )
     except OSError as error:
         raise _KilledError(f"CoACD's process cannot be started ({error.strerror})") from error
+    # communicate() forgets what it has not written when its time is up
+    pipe, child.stdin = child.stdin, None
+    threading.Thread(target=_write, args=(pipe, given.getvalue()), daemon=True).start()
     try:
-        content = given.getvalue()
         while True:
             try:
-                found, message = child.communicate(content, timeout=0.2)
+                found, message = child.communicate(timeout=0.2)
                 break
             except subprocess.TimeoutExpired:
-                content = None  # it is on its way
                 if stop.is_set() or time.monotonic() > deadline:
                     raise BackendError(f"CoACD was stopped after {limit:.0f} s") from None
     finally:  # also on KeyboardInterrupt
@@ -184,6 +186,11 @@ def _ask_child(vertices, faces, *, deadline: float, stop: threading.Event, **set
             return np.split(data["vertices"], np.cumsum(data["counts"])[:-1])
     except Exception as error:  # of any kind, see _load
         raise BackendError(f"CoACD's answer cannot be read ({error})") from error
+
+
+def _write(pipe: BinaryIO, content: bytes) -> None:
+    with contextlib.suppress(OSError), pipe:  # the child may have been killed
+        pipe.write(content)
 
 
 def _cut(

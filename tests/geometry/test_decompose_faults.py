@@ -172,6 +172,16 @@ def test_killed_while_an_entry_is_written_nothing_of_it_is_read_and_an_hour_late
     assert [Path(name).suffix for name in files(folder)] == [".npz", ".npz"]
 
 
+def test_a_child_that_is_slow_to_start_gets_all_of_a_large_mesh(cache, monkeypatch):
+    """More than a pipe holds, 64 KiB."""
+    slow = module._CHILD.replace("import coacd, numpy", "time.sleep(0.5); import coacd, numpy")
+    monkeypatch.setattr(module, "_child_command", [sys.executable, "-P", "-c", slow])
+    mesh = l_shape()
+    while len(mesh.faces) < 1500:
+        mesh = mesh.subdivide()
+    assert decompose(mesh, module.DecomposeOptions(time_limit_s=30, max_faces=10_000)).report.method == "coacd"
+
+
 def test_the_child_of_a_killed_process_ends_by_itself(cache, monkeypatch):
     hang = module._CHILD.replace("import coacd, numpy", "time.sleep(60)")
     monkeypatch.setattr(module, "_child_command", [sys.executable, "-P", "-c", hang])
