@@ -173,7 +173,6 @@ class PhysPoseRefiner(nn.Module):
         """
         poses = as_matrix(poses)
         check_poses(poses, scene)
-        _check_metres(poses, scene)
         leading, shape = poses.shape[:-3], poses.shape[:-2]
         hypotheses = leading.numel()
         moves = _checked_mask(refine_only, scene).repeat(hypotheses)
@@ -183,6 +182,7 @@ class PhysPoseRefiner(nn.Module):
             torch.autocast(poses.device.type, enabled=False),
         ):
             measured = poses.detach().clone().double().reshape(-1, 4, 4)
+            _check_metres(measured.reshape(*shape, 4, 4), scene)
             if measured_covariance is not None:
                 measured_covariance = torch.as_tensor(measured_covariance).detach().clone()
             covariance = flatten_covariance(measured_covariance, poses)

@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import torch
@@ -14,6 +13,7 @@ from physpose_torch.distance.broadphase import near_spheres
 from physpose_torch.errors import InvalidInputError
 from physpose_torch.geometry.body import Body, Plane
 from physpose_torch.geometry.convex import ConvexParts
+from physpose_torch.lasting import lasting_property
 
 __all__ = ["Scene", "Static", "as_matrix"]
 
@@ -77,7 +77,7 @@ class _Packing:
     def __init__(self, bodies: Iterable[Body]) -> None:
         self.number = {body: i for i, body in enumerate(dict.fromkeys(bodies))}
 
-    @cached_property
+    @lasting_property
     def parts(self) -> ConvexParts:
         return ConvexParts.cat([body.parts for body in self.number])
 
@@ -223,19 +223,19 @@ class Scene:
 
     # ---- packed views: entities are the objects, then the static bodies; an instance is a part of an entity
 
-    @cached_property
+    @lasting_property
     def static_bodies(self) -> list[Static]:
         return [s for s in self.statics if isinstance(s.shape, Body)]
 
-    @cached_property
+    @lasting_property
     def planes(self) -> list[Static]:
         return [s for s in self.statics if isinstance(s.shape, Plane)]
 
-    @cached_property
+    @lasting_property
     def _packing(self) -> _Packing:
         return _Packing([*self.objects, *(s.shape for s in self.static_bodies)])
 
-    @cached_property
+    @lasting_property
     def _entity_body(self) -> Tensor:
         """(N + S,) number of every entity's body among those that are packed."""
         number = self._packing.number
@@ -247,35 +247,35 @@ class Scene:
         """Convex parts of the different bodies, each body once; those of a selection are still those of the whole."""
         return self._packing.parts
 
-    @cached_property
+    @lasting_property
     def entity_image(self) -> Tensor:
         """(N + S,) image of every object and static body."""
         return torch.cat([self.image, torch.tensor([s.image for s in self.static_bodies], dtype=torch.long)])
 
-    @cached_property
+    @lasting_property
     def instance_start(self) -> Tensor:
         """(N + S + 1,) long: entity e has the instances ``instance_start[e]:instance_start[e + 1]``."""
         counts = self.parts.part_start.diff()[self._entity_body]
         return torch.cat([counts.new_zeros(1), counts.cumsum(0)])
 
-    @cached_property
+    @lasting_property
     def instance_entity(self) -> Tensor:
         """(Q,) entity of every part instance."""
         return _ranges(self.instance_start[:-1], self.instance_start.diff())[0]
 
-    @cached_property
+    @lasting_property
     def instance_part(self) -> Tensor:
         """(Q,) index of every instance into :attr:`parts`."""
         return _ranges(self.parts.part_start[self._entity_body], self.instance_start.diff())[1]
 
-    @cached_property
+    @lasting_property
     def has_static(self) -> Tensor:
         """(I,) bool: whether anything static is known in each image."""
         known = torch.zeros(self.n_images, dtype=torch.bool)
         known[[s.image for s in self.statics]] = True
         return known
 
-    @cached_property
+    @lasting_property
     def plane_image(self) -> Tensor:
         """(L,) image of every plane."""
         return torch.tensor([s.image for s in self.planes], dtype=torch.long)
@@ -291,23 +291,23 @@ class Scene:
         """(L,) [m], float64."""
         return _stack([s.shape.offset for s in self.planes], (0,))
 
-    @cached_property
+    @lasting_property
     def plane_covariance(self) -> Tensor:
         """(L, 3, 3) of (two tilts [rad], offset [m]), zero for exact planes."""
         zero = torch.zeros(3, 3, dtype=torch.float64)
         return _stack([zero if s.shape.covariance is None else s.shape.covariance for s in self.planes], (0, 3, 3))
 
-    @cached_property
+    @lasting_property
     def plane_uncertain(self) -> bool:
         """Whether any plane has a covariance."""
         return any(s.shape.covariance is not None for s in self.planes)
 
-    @cached_property
+    @lasting_property
     def object_center(self) -> Tensor:
         """(N, 3) centre of the bounds of each object, object frame [m]."""
         return _stack([b.center for b in self._packing.number], (0, 3))[self._entity_body[: len(self)]]
 
-    @cached_property
+    @lasting_property
     def entity_span(self) -> Tensor:
         """(N + S,) largest distance of a point of each entity's parts from the origin of its frame [m]."""
         if not len(self.entity_image):
@@ -316,7 +316,7 @@ class Scene:
         span = torch.zeros(len(self.entity_image), dtype=torch.float64)
         return span.scatter_reduce(0, self.instance_entity, length[self.instance_part], "amax")
 
-    @cached_property
+    @lasting_property
     def entity_pairs(self) -> Tensor:
         """(E, 2) pairs of entities that may meet: of one image, at least one movable, not alternatives of one object."""
         order = torch.argsort(self.entity_image, stable=True)
@@ -339,7 +339,7 @@ class Scene:
                 found.append(rows[near_spheres(center[rows], self.entity_span[rows], margin)])
         return self._may_meet(torch.cat(found))
 
-    @cached_property
+    @lasting_property
     def crowded(self) -> bool:
         """Whether any image holds more than ``CROWD`` objects and static bodies."""
         return bool((torch.bincount(self.entity_image) > CROWD).any())
@@ -361,7 +361,7 @@ class Scene:
         out[:, :3, 3] -= T[first[self.entity_image].to(T.device), :3, 3]
         return out
 
-    @cached_property
+    @lasting_property
     def plane_pairs(self) -> Tensor:
         """(E, 2) pairs (object, plane) of one image."""
         order = torch.argsort(self.plane_image, stable=True)

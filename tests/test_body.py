@@ -133,6 +133,11 @@ def test_a_large_mesh_is_cut_as_finely_as_a_small_one_and_says_how_well(options)
         (lambda: Body.from_mesh(trimesh.creation.box(), label="tin", scale=-1.0), InvalidInputError, "tin: scale"),
         (lambda: Body.from_mesh(trimesh.creation.box(), label="tin", hulls=3), InvalidInputError, "tin.*max_hulls"),
         (lambda: Body.from_mesh(trimesh.Trimesh(), label="tin"), DataError, "tin.*no faces"),
+        (
+            lambda: Body.from_mesh(trimesh.creation.box([40.0] * 3), label="tin", scale=1.0, tolerance=1e-3),
+            InvalidInputError,
+            "tin is 40 m large: tolerance 0.001 m, expected 0.0016 or more",
+        ),
         (lambda: Body.from_mesh(42, label="tin"), InvalidInputError, "tin.*int"),
     ],
 )

@@ -18,6 +18,7 @@ from bop_files import HEADER, OFFSET_MM, UP, csv_row, standing, write_models, wr
 from physpose_torch.__main__ import main
 from physpose_torch.commands.batches import Batch
 from physpose_torch.commands.engines import ATTEMPTS, refine_on_ray
+from physpose_torch.errors import PhysPoseError
 
 ray = pytest.importorskip("ray", reason="needs the extra: pip install 'physpose-torch[ray]'")
 pytestmark = pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="looks for workers in /proc")
@@ -136,6 +137,19 @@ def test_a_batch_whose_worker_dies_is_begun_again(tmp_path, cluster, caplog):
     assert "a worker died; batch 3 is begun again" in caplog.messages
 
 
+class _Wrong(_Fatal):
+    def __call__(self, numbers):
+        raise self.times
+
+
+@pytest.mark.parametrize(
+    ("error", "told"), [(ValueError("no such thing"), "no such thing"), (OSError("no disk"), "on .*: no disk")], ids=str
+)
+def test_what_is_wrong_on_a_worker_is_told_in_a_line(tmp_path, cluster, error, told):
+    with pytest.raises(PhysPoseError, match=f"^--engine ray.*{told}"):
+        list(refine_on_ray(_Wrong(tmp_path, error), [np.array([n]) for n in range(2)]))
+
+
 def test_a_batch_that_kills_every_worker_is_left_alone_and_the_others_are_not(tmp_path, cluster):
     found = list(refine_on_ray(_Fatal(tmp_path, 99), [np.array([n]) for n in range(6)]))
     assert [b.rows for b in found] == [[[n, "done"]] if n != 3 else [] for n in range(6)]
@@ -221,6 +235,23 @@ def test_the_benchmark_tells_rates_and_differences(dataset, cluster, capsys):
     assert there["images_per_second"] > 0
     assert (there["rows_that_differ"], there["difference_mm"]) == (0, 0.0)
     assert "Ray, 2 workers" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM])
+def test_when_asked_to_stop_it_says_so_and_leaves_no_process(dataset, alone, sign):
+    command = [sys.executable, "-m", "physpose_torch", *arguments(dataset, "out.csv", "--engine", "ray")]
+    environment = {**os.environ, "RAY_ADDRESS": "local"}
+    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as process:
+        while process.poll() is None and journal_of(dataset) < 2:
+            time.sleep(0.01)
+        process.send_signal(sign)
+        message = process.stderr.read()
+    assert process.returncode == 130
+    assert "images are done; the same command with --resume goes on" in message
+    assert not workers()
+    assert main(arguments(dataset, "out.csv", "--resume")) == 1
+    assert result(dataset, "out.csv") == alone
 
 
 @pytest.mark.slow

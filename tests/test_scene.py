@@ -1,11 +1,15 @@
 """Scenes: what they refuse, that cat and select undo each other, and what may meet what."""
 
+import copy
+import pickle
+
 import pytest
 import torch
 
+from physpose_torch.config import PhysicsConfig
 from physpose_torch.contacts import find_contacts
 from physpose_torch.errors import InvalidInputError
-from physpose_torch.geometry.body import Plane
+from physpose_torch.geometry.body import Body, Plane
 from physpose_torch.losses import PhysicsLoss
 from physpose_torch.report import physics_report
 from physpose_torch.scene import Scene, Static
@@ -220,7 +224,11 @@ def test_a_plane_moved_in_place_or_first_seen_without_gradients_is_seen_as_it_is
         assert float(gradient) == pytest.approx(1.0)
 
 
-def test_a_scene_first_used_or_made_in_inference_mode_can_be_trained_on(table, box, can, angle):
+@pytest.mark.parametrize("gravity", ["support", "paper"])
+def test_a_scene_first_used_or_made_in_inference_mode_can_be_trained_on(table, angle, gravity):
+    loss, box = PhysicsLoss(PhysicsConfig(gravity=gravity)), Body.box((0.1, 0.06, 0.04), label="box")
+    can = Body.cylinder(0.03, 0.08, label="can")
+
     def make():
         statics = [Static(Plane.from_pose(table.at())), Static(box, table.at(0.0, 0.05, 0.02))]
         return Scene([can, angle], statics, gravity=-Plane.from_pose(table.at()).normal)
@@ -228,20 +236,30 @@ def test_a_scene_first_used_or_made_in_inference_mode_can_be_trained_on(table, b
     with torch.inference_mode():
         scenes = [make(), make()]
         poses = table.poses((0, 0, 0.03), (0.02, 0.05, 0.05))
-        PhysicsLoss()(poses, scenes[0])
+        loss(poses, scenes[0])
         physics_report(poses, scenes[0])
     poses = poses.clone()
     for scene in [*scenes, make()]:
         leaf = poses.clone().requires_grad_()
-        terms = PhysicsLoss()(leaf, scene, measured=poses)
+        terms = loss(leaf, scene, measured=poses)
         terms.total.sum().backward()
         assert bool(leaf.grad.isfinite().all())
         assert float(leaf.grad.abs().max()) > 0
 
 
-def test_a_body_first_used_in_inference_mode_can_be_trained_on(table):
-    from physpose_torch.geometry.body import Body
+def test_copies_of_a_scene_stand_by_themselves(table, box, can):
+    """Their parts have numbers of their own, in another process, too."""
+    poses = table.poses((0, 0, 0.03), (0.02, 0.05, 0.05))
+    scene = Scene([box, can], [Static(box, table.at(0.0, 0.05, 0.02))], gravity=table.gravity)
+    expected = PhysicsLoss()(poses, scene).total
+    copies = [copy.deepcopy(scene), pickle.loads(pickle.dumps(scene))]
+    assert len({s.parts.handle for s in [scene, *copies]}) == 3
+    del scene
+    for other in copies:
+        torch.testing.assert_close(PhysicsLoss()(poses, other).total, expected, atol=0, rtol=0)
 
+
+def test_a_body_first_used_in_inference_mode_can_be_trained_on(table):
     with torch.inference_mode():
         bodies = [Body.box((0.1, 0.1, 0.1), label="crate"), Body.cylinder(0.03, 0.08, label="can")]
         physics_report(table.poses((0, 0, 0.05), (0, 0, 0.13)), Scene.tabletop(bodies, table.plane))
@@ -252,8 +270,6 @@ def test_a_body_first_used_in_inference_mode_can_be_trained_on(table):
 
 def test_a_static_part_pushes_where_a_plane_would(table, box):
     """A static slab whose top is the table gives the distances of the plane."""
-    from physpose_torch.geometry.body import Body
-
     slab = Body.box((2.0, 2.0, 0.2), label="slab")
     pose = table.poses((0, 0, 0.015, (0, 0, 0.3)))
     flat = find_contacts(pose, Scene.tabletop([box], table.plane))

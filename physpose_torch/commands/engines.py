@@ -5,6 +5,9 @@ import functools
 import json
 import logging
 import os
+import signal
+import threading
+import traceback
 import warnings
 from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
@@ -62,7 +65,7 @@ def refine_on_ray(
         job = _Job(__version__, os.getcwd(), {k: os.environ[k] for k in CACHES if k in os.environ}, attempts, payload)
         _check_nodes(ray, job)
         told: set[str] = set()
-        for row in _dataset(ray, job, len(batches), workers).iter_rows():
+        for row in _rows(ray, job, len(batches), workers):
             found = json.loads(row["found"])
             for message in found["messages"]:
                 if message not in told:  # every worker says so once
@@ -118,11 +121,15 @@ def _ray() -> Any:
 
 
 def _start(ray: Any) -> None:
+    before = signal.getsignal(signal.SIGTERM)
     try:
         ray.init(include_dashboard=False, logging_level=logging.ERROR, log_to_driver=False)
     except Exception as error:
         where = os.environ.get("RAY_ADDRESS", "on this machine")
         raise BackendError(f"--engine ray: the cluster {where} cannot be used ({error}); check RAY_ADDRESS") from None
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, before)  # Ray's ends the process without a word
 
 
 def _check_nodes(ray: Any, job: _Job) -> None:
@@ -135,12 +142,16 @@ def _check_nodes(ray: Any, job: _Job) -> None:
         try:
             ray.get(answer)
         except ray.exceptions.RayError as error:
-            why = str(getattr(error, "cause", error)).strip().splitlines()[-1]
             remedy = f"install physpose-torch {__version__} there as here"
-            raise BackendError(f"--engine ray: {node['NodeManagerAddress']} cannot refine ({why}); {remedy}") from None
+            raise BackendError(f"--engine ray: {node['NodeManagerAddress']} cannot refine ({_why(error)}); {remedy}") from None
 
 
-def _dataset(ray: Any, job: _Job, count: int, workers: int | None) -> Any:
+def _why(error: Exception) -> str:
+    """The last line of what a worker said."""
+    return ("\n" + str(getattr(error, "cause", error)).strip()).splitlines()[-1] or type(error).__name__
+
+
+def _rows(ray: Any, job: _Job, count: int, workers: int | None) -> Iterator[dict[str, Any]]:
     """A row for each batch: its number, and what became of it."""
     logging.getLogger("ray.data").setLevel(logging.ERROR)
     context = ray.data.DataContext.get_current()
@@ -148,7 +159,11 @@ def _dataset(ray: Any, job: _Job, count: int, workers: int | None) -> Any:
     context.execution_options.preserve_order = True
     numbers = ray.data.range(count, override_num_blocks=count)
     compute = ray.data.TaskPoolStrategy(workers)
-    return numbers.map_batches(_refine_on_worker, batch_size=1, fn_kwargs={"job": job}, num_cpus=1, compute=compute)
+    found = numbers.map_batches(_refine_on_worker, batch_size=1, fn_kwargs={"job": job}, num_cpus=1, compute=compute)
+    try:
+        yield from found.iter_rows()
+    except ray.exceptions.RayError as error:
+        raise BackendError(f"--engine ray: {_why(error)}; --resume goes on, with another --engine, too") from error
 
 
 def _refine_on_worker(row: dict[str, np.ndarray], *, job: _Job) -> dict[str, list]:
@@ -156,7 +171,6 @@ def _refine_on_worker(row: dict[str, np.ndarray], *, job: _Job) -> dict[str, lis
     file; neither where too many workers died of it."""
     import ray
 
-    refine, batches = _make_ready(job)
     number, found = int(row["id"][0]), {}
     with _messages() as found["messages"]:
         begun = ray.get(job.attempts.begin.remote(number))
@@ -164,9 +178,14 @@ def _refine_on_worker(row: dict[str, np.ndarray], *, job: _Job) -> dict[str, lis
             logger.warning("a worker died; batch %d is begun again", number)
         try:
             if begun <= ATTEMPTS:
+                refine, batches = _make_ready(job)
                 found["batch"] = refine(batches[number])
-        except PhysPoseError as error:
+        except DataError as error:
             found["error"] = str(error)
+        except Exception as error:  # Ray would bury it
+            if not isinstance(error, PhysPoseError | OSError):
+                logger.warning("%s", traceback.format_exc())
+            found["error"] = f"--engine ray, on {ray.util.get_node_ip_address()}: {error}"
     return {"number": [number], "found": [json.dumps(found)]}
 
 

@@ -4,10 +4,12 @@ The kernels (``physpose_torch/distance/kernels``) are compiled on first use, whi
 ``torch.compile`` sees two opaque operators, ``physpose_torch::signed_distance`` and ``physpose_torch::drop_distance``.
 """
 
+import atexit
 import contextlib
 import functools
 import logging
 import os
+import shutil
 import tempfile
 import threading
 import weakref
@@ -71,9 +73,11 @@ def initialise() -> None:
 
 
 @functools.cache
-def _temporary() -> tempfile.TemporaryDirectory:
-    """A folder for kernels that lasts as long as this process."""
-    return tempfile.TemporaryDirectory(prefix="physpose-kernels-", ignore_cleanup_errors=True)
+def _temporary() -> str:
+    """A folder for kernels that lasts as long as this process, and not only as long as one that it forks."""
+    folder, maker = tempfile.mkdtemp(prefix="physpose-kernels-"), os.getpid()
+    atexit.register(lambda: os.getpid() == maker and shutil.rmtree(folder, ignore_errors=True))
+    return folder
 
 
 def _compile_elsewhere(error: Exception) -> None:
@@ -82,7 +86,7 @@ def _compile_elsewhere(error: Exception) -> None:
         "set WARP_CACHE_PATH to a writable folder",
         error,
     )
-    wp.config.kernel_cache_dir = _temporary().name
+    wp.config.kernel_cache_dir = _temporary()
 
 
 def _make_sure_of_room(module: "wp.Module") -> None:

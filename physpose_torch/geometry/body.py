@@ -2,7 +2,6 @@
 
 import contextlib
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from physpose_torch import se3
 from physpose_torch.errors import DataError, InvalidInputError
 from physpose_torch.geometry.convex import ConvexParts
 from physpose_torch.geometry.decompose import DecomposeOptions, DecomposeReport, decompose
+from physpose_torch.lasting import lasting_property
 from physpose_torch.reading import inside
 
 __all__ = ["FARTHEST", "Body", "Plane", "is_flat", "load_mesh", "read_mesh"]
@@ -127,27 +127,27 @@ class Body:
         rim = mesh.vertices[np.linalg.norm(mesh.vertices[:, :2], axis=1) > 0.5 * radius]
         return cls(label, ConvexParts.from_hulls([rim]), mesh)
 
-    @cached_property
+    @lasting_property
     def lower(self) -> Tensor:
         """(3,) least coordinates of the mesh [m]."""
         return torch.tensor(self.mesh.bounds[0], dtype=torch.float64)
 
-    @cached_property
+    @lasting_property
     def upper(self) -> Tensor:
         """(3,) greatest coordinates of the mesh [m]."""
         return torch.tensor(self.mesh.bounds[1], dtype=torch.float64)
 
-    @cached_property
+    @lasting_property
     def center(self) -> Tensor:
         """(3,) centre of the bounds; viewing rays go there [m]."""
         return 0.5 * (self.lower + self.upper)
 
-    @cached_property
+    @lasting_property
     def radius(self) -> float:
         """Largest distance of a surface point from :attr:`center` [m]."""
         return float(np.linalg.norm(self.mesh.vertices - self.center.numpy(), axis=1).max())
 
-    @cached_property
+    @lasting_property
     def center_of_mass(self) -> Tensor:
         """(3,) centre of mass at uniform density [m].
 
@@ -289,8 +289,12 @@ def _decompose_large(
     mesh: trimesh.Trimesh, size: float, options: DecomposeOptions, own_tolerance: bool, **keywords
 ) -> tuple[list[np.ndarray], DecomposeReport]:
     """A mesh of ``size`` [m] decomposed as if it were an object on a table: errors are a share of its size."""
-    factor = size / HOUSEHOLD
+    factor, least = size / HOUSEHOLD, 1e-5 * size / HOUSEHOLD
     if own_tolerance:
+        if options.tolerance < least:
+            raise InvalidInputError(
+                f"{keywords['name']} is {size:.4g} m large: tolerance {options.tolerance} m, expected {least:.2g} or more"
+            )
         options = replace(options, tolerance=options.tolerance / factor)
     hulls, report = decompose(mesh.copy().apply_scale(1 / factor), options, **keywords)
     errors = {name: factor * getattr(report, name) for name in ("outward_p95", "outward_max", "inward_p95", "inward_max")}

@@ -4,7 +4,6 @@ import itertools
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from physpose_torch.errors import InvalidInputError
+from physpose_torch.lasting import lasting_property
 
 __all__ = ["ConvexParts", "Facets"]
 
@@ -67,6 +67,10 @@ class ConvexParts:
     def __post_init__(self) -> None:
         _sets[self.handle] = self
 
+    def __reduce__(self) -> tuple:
+        """A copy is another set, with a number of its own, in another process, too."""
+        return ConvexParts, tuple(getattr(self, f.name) for f in fields(self) if f.init)
+
     @staticmethod
     def by_handle(handle: int) -> "ConvexParts":
         """The living set with this :attr:`handle`."""
@@ -117,7 +121,7 @@ class ConvexParts:
         }
         return ConvexParts(vertices=vertices, **rest)
 
-    @cached_property
+    @lasting_property
     def reference(self) -> "ConvexParts":
         """The same parts in float64 on the CPU, converted once: what exact distances are computed with."""
         return self.to(device="cpu", dtype=torch.float64)
@@ -138,44 +142,44 @@ class ConvexParts:
     def device(self) -> torch.device:
         return self.vertices.device
 
-    @cached_property
+    @lasting_property
     def vertex_count(self) -> Tensor:
         """(P,) long."""
         return self.vertex_start.diff()
 
-    @cached_property
+    @lasting_property
     def padded(self) -> Tensor:
         """(P, K, 3) vertices, the first one repeated up to the largest count K: a maximum needs no mask."""
         if self.n_parts == 0:
             return self.vertices.new_zeros(0, 1, 3)
         return self.vertices[_padding(self.vertex_start)[0]]
 
-    @cached_property
+    @lasting_property
     def padded_mask(self) -> Tensor:
         """(P, K) bool: which of :attr:`padded` are vertices rather than padding."""
         return torch.arange(self.padded.shape[1], device=self.device) < self.vertex_count[:, None]
 
-    @cached_property
+    @lasting_property
     def lower(self) -> Tensor:
         """(P, 3) least coordinates."""
         return self.padded.amin(1) if self.n_parts else self.vertices.new_zeros(0, 3)
 
-    @cached_property
+    @lasting_property
     def upper(self) -> Tensor:
         """(P, 3) greatest coordinates."""
         return self.padded.amax(1) if self.n_parts else self.vertices.new_zeros(0, 3)
 
-    @cached_property
+    @lasting_property
     def center(self) -> Tensor:
         """(P, 3) centres of the bounds."""
         return 0.5 * (self.lower + self.upper)
 
-    @cached_property
+    @lasting_property
     def radius(self) -> Tensor:
         """(P,) radii of bounding spheres around :attr:`center`."""
         return torch.linalg.vector_norm(self.padded - self.center[:, None], dim=-1).amax(1)
 
-    @cached_property
+    @lasting_property
     def facets(self) -> Facets:
         """Faces and edges of all parts."""
         members = self.__dict__.get("_members", ())
@@ -197,7 +201,7 @@ class ConvexParts:
         offsets = (self.padded[part] @ normals[:, :, None])[:, :, 0].amax(1) if len(normals) else normals[:, 0]
         return Facets(normals, offsets, start, edges, edge_start)
 
-    @cached_property
+    @lasting_property
     def _padded_facets(self) -> tuple[Tensor, Tensor, Tensor]:
         f = self.facets
         face, _ = _padding(f.start)
