@@ -22,11 +22,27 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-__all__ = ["cache_folder", "one_at_a_time", "remove_abandoned", "replacing", "write_file", "written"]
+__all__ = ["cache_folder", "one_at_a_time", "remove_abandoned", "replacing", "resolved", "write_file", "written"]
 
 ABANDONED = 3600.0
 """[s]; a temporary file of this age is that of a killed process."""
 _STREAM = re.compile(r"/dev/(fd/|std)|/proc/")
+
+
+def resolved(path: Path) -> Path:
+    """Where a path leads, links followed; nothing need be there.
+
+    Raises:
+        OSError: its links go round in a circle.
+    """
+    try:
+        real = path.resolve()
+        loops = real.is_symlink()  # Python 3.13 tells of no loop
+    except RuntimeError:
+        loops = True
+    if loops:
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
+    return real
 
 
 @contextlib.contextmanager
@@ -42,7 +58,7 @@ def replacing(path: Path, *, temporary: Path | None = None) -> Iterator[BinaryIO
     Raises:
         OSError: it cannot be written; nothing is left behind, and ``path`` is as it was.
     """
-    path = path.resolve()
+    path = resolved(path)
     if path.exists() and not os.access(path, os.W_OK):
         raise PermissionError(errno.EACCES, "it is read-only")
     if temporary is None:

@@ -166,6 +166,14 @@ def test_where_nothing_may_be_written_nothing_is_begun(name, dataset, tmp_path, 
     assert re.search(rf"out\.(json|csv) {message}; name a file to write", capsys.readouterr().err)
 
 
+def test_a_loop_of_links_is_no_output(name, dataset, tmp_path, monkeypatch, capsys):
+    (tmp_path / "out.json").symlink_to("other")
+    (tmp_path / "other").symlink_to("out.json")
+    monkeypatch.setattr("physpose_torch.commands.images.ImageOptions.open", None)
+    assert run(name, dataset, tmp_path / "out.json") == 2
+    assert "out.json: cannot be written (Too many levels of symbolic links)" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("name", ["calibrate", "report"], indirect=True)
 def test_when_asked_to_stop_it_says_so_and_nothing_is_written(name, dataset, tmp_path, monkeypatch, sign):

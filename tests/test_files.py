@@ -125,6 +125,15 @@ def test_a_link_stays_and_so_do_permissions(tmp_path):
     assert files(tmp_path) == ["link", "real"]
 
 
+def test_a_loop_of_links_is_named_and_stays(tmp_path):
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    for name in ("a", "a/out.json"):
+        with pytest.raises(DataError, match=f"{name}: cannot be written .*symbolic links"):
+            write_file(tmp_path / name, NEW)
+    assert (tmp_path / "a").is_symlink()
+
+
 def test_a_read_only_file_is_not_replaced(tmp_path, monkeypatch):
     path = tmp_path / "out.json"
     path.write_bytes(OLD)

@@ -8,6 +8,7 @@ from typing import Any
 from tqdm import tqdm
 
 from physpose_torch.errors import DataError
+from physpose_torch.files import resolved, written
 
 __all__ = ["check_output", "describe", "progress", "table"]
 
@@ -16,12 +17,13 @@ def check_output(*paths: Path | None) -> None:
     """Refuse to start long work whose results could not be written.
 
     Raises:
-        DataError: a file's folder does not exist, or the path is a folder, or one of them is read-only.
+        DataError: a file's folder does not exist, or the path is a folder or a loop of links, or one of them is read-only.
     """
     for path in paths:
         if path is None:
             continue
-        folder = path.absolute().parent
+        with written(path):
+            folder = resolved(path).parent
         faults = {
             "is a folder": path.is_dir(),
             "lies in no existing folder": not folder.is_dir(),
