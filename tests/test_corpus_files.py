@@ -25,6 +25,7 @@ from physpose_torch.bop.formats import read_statics
 from physpose_torch.bop.table import read_image, read_pairs
 from physpose_torch.errors import DataError
 from physpose_torch.geometry.decompose import decompose
+from physpose_torch.robot.urdf import read_urdf
 
 pytestmark = [
     pytest.mark.skipif(sys.platform != "linux", reason="links, pipes and limits of Linux"),
@@ -147,6 +148,22 @@ def test_a_pipe_with_a_writer_is_read_however_slow_it_is(tmp_path):
     os.read(read, 1)
     assert module.load_json(tmp_path / "planes.json") == {"a": 1}
     os.waitpid(child, 0)
+
+
+@pytest.mark.parametrize("read", [module.load_json, read_urdf])
+def test_a_pipe_without_end_is_left_soon_and_a_large_file_is_not_read(tmp_path, monkeypatch, read):
+    monkeypatch.setattr(module, "LARGEST", 5_000_000)
+    monkeypatch.setattr(module, "PATIENCE", 5.0)
+    path = tmp_path / "file"
+    os.mkfifo(path)
+    writer = os.posix_spawn("/bin/sh", ["sh", "-c", f"head -c 100M /dev/zero > {path}"], os.environ)
+    with pytest.raises(DataError, match=r"file: more than 0\.0 GB are too much"):
+        read(path)
+    assert os.waitstatus_to_exitcode(os.waitpid(writer, 0)[1]) != 0  # it could not write all of it
+    path.unlink()
+    sparse(path)
+    with pytest.raises(DataError, match="too much"):
+        read(path)
 
 
 PICTURES = {
