@@ -22,7 +22,7 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-__all__ = ["cache_folder", "one_at_a_time", "remove_abandoned", "replacing", "resolved", "write_file", "written"]
+__all__ = ["cache_folder", "one_at_a_time", "remove_abandoned", "replacing", "resolved", "streams", "write_file", "written"]
 
 ABANDONED = 3600.0
 """[s]; a temporary file of this age is that of a killed process."""
@@ -77,6 +77,11 @@ def replacing(path: Path, *, temporary: Path | None = None) -> Iterator[BinaryIO
             temporary.unlink()
 
 
+def streams(path: Path) -> bool:
+    """Whether a path is written to directly and not replaced: a pipe, /dev/stdout, or else no regular file."""
+    return bool(_STREAM.match(str(path.absolute()))) or (path.exists() and not path.is_file())
+
+
 @contextlib.contextmanager
 def written(path: str | os.PathLike) -> Iterator[None]:
     """Tell that a file cannot be written as a :class:`DataError` that names it."""
@@ -94,7 +99,7 @@ def write_file(path: str | os.PathLike, content: str | bytes) -> None:
     """
     path, data = Path(path), content.encode() if isinstance(content, str) else content
     with written(path):
-        if _STREAM.match(str(path.absolute())) or (path.exists() and not path.is_file()):
+        if streams(path):
             with open(path, "ab") as file:  # a file that /dev/stdout stands for is not emptied
                 file.write(data)
         else:

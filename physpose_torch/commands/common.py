@@ -8,7 +8,7 @@ from typing import Any
 from tqdm import tqdm
 
 from physpose_torch.errors import DataError
-from physpose_torch.files import resolved, written
+from physpose_torch.files import resolved, streams, written
 
 __all__ = ["check_output", "describe", "progress", "table"]
 
@@ -23,12 +23,13 @@ def check_output(*paths: Path | None) -> None:
         if path is None:
             continue
         with written(path):
-            folder = resolved(path).parent
+            replaced = not streams(path)
+            folder = (resolved(path) if replaced else path.absolute()).parent
         faults = {
             "is a folder": path.is_dir(),
             "lies in no existing folder": not folder.is_dir(),
             "is read-only": path.exists() and not os.access(path, os.W_OK),
-            "lies in a read-only folder": not path.exists() and not os.access(folder, os.W_OK),
+            "lies in a read-only folder": replaced and not os.access(folder, os.W_OK),
         }
         if told := [what for what, true in faults.items() if true]:
             raise DataError(f"{path} {told[0]}; name a file to write")
