@@ -22,10 +22,22 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-__all__ = ["cache_folder", "one_at_a_time", "remove_abandoned", "replacing", "resolved", "streams", "write_file", "written"]
+__all__ = [
+    "TEMPORARY",
+    "cache_folder",
+    "one_at_a_time",
+    "remove_abandoned",
+    "replacing",
+    "resolved",
+    "streams",
+    "write_file",
+    "written",
+]
 
 ABANDONED = 3600.0
 """[s]; a temporary file of this age is that of a killed process."""
+TEMPORARY = "." + "[0-9a-f]" * 32 + ".tmp"
+"""How the names of :func:`replacing`'s temporary files end, as a pattern."""
 _STREAM = re.compile(r"/dev/(fd/|std)|/proc/")
 
 
@@ -62,7 +74,7 @@ def replacing(path: Path, *, temporary: Path | None = None) -> Iterator[BinaryIO
     if path.exists() and not os.access(path, os.W_OK):
         raise PermissionError(errno.EACCES, "it is read-only")
     if temporary is None:
-        remove_abandoned(path.parent, f".{glob.escape(path.name[:40])}.*.tmp")
+        remove_abandoned(path.parent, f".{glob.escape(path.name[:40])}{TEMPORARY}")
         temporary = path.with_name(f".{path.name[:40]}.{uuid.uuid4().hex}.tmp")
     try:
         with open(temporary, "wb") as file:
@@ -129,9 +141,9 @@ def one_at_a_time(path: Path, *, patience: float, stop: threading.Event) -> Iter
     """Of several processes and threads that make the same file, one is in the block and the others wait; yields whether it did.
 
     They do so for ``patience`` [s], and until ``stop`` is set. Where there is no lock to be had nobody waits; that of a killed
-    process is no lock.
+    process is no lock, and goes with the next.
     """
-    lock = path.with_name(f".{path.name}.lock.tmp")
+    lock = path.with_name(f".{path.name}.lock")
     file, waited, end = None, False, time.monotonic() + patience
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)

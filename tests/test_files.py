@@ -125,6 +125,15 @@ def test_a_link_stays_and_so_do_permissions(tmp_path):
     assert files(tmp_path) == ["link", "real"]
 
 
+def test_what_is_not_ours_is_not_swept(tmp_path):
+    theirs, ours = tmp_path / ".out.json.backup.tmp", tmp_path / f".out.json.{'0' * 32}.tmp"
+    for path in (theirs, ours):
+        path.touch()
+        os.utime(path, (0, 0))
+    write_file(tmp_path / "out.json", NEW)
+    assert files(tmp_path) == [theirs.name, "out.json"]
+
+
 def test_a_loop_of_links_is_named_and_stays(tmp_path):
     (tmp_path / "a").symlink_to("b")
     (tmp_path / "b").symlink_to("a")
