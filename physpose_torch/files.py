@@ -81,7 +81,7 @@ def replacing(path: Path, *, temporary: Path | None = None) -> Iterator[BinaryIO
             yield file
             file.flush()
             os.fsync(file.fileno())
-        with contextlib.suppress(FileNotFoundError):
+        with contextlib.suppress(OSError):  # there is no old one, or the file system has no permissions
             shutil.copymode(path, temporary)
         os.replace(temporary, path)
     finally:

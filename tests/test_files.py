@@ -1,7 +1,9 @@
 """Files are there as a whole or not at all, whatever happens while they are written."""
 
+import errno
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -132,6 +134,15 @@ def test_what_is_not_ours_is_not_swept(tmp_path):
         os.utime(path, (0, 0))
     write_file(tmp_path / "out.json", NEW)
     assert files(tmp_path) == [theirs.name, "out.json"]
+
+
+def test_where_there_are_no_permissions_it_is_written(path, monkeypatch):
+    def refuse(*_):
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(shutil, "copymode", refuse)
+    write_file(path, NEW)
+    assert path.read_bytes() == NEW
 
 
 def test_a_loop_of_links_is_named_and_stays(tmp_path):
