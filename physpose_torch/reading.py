@@ -1,17 +1,23 @@
 """Reading what may be anything: files that data names, of any size, kind and content, each with an error that names it."""
 
+import contextlib
 import json
 import os
 import reprlib
 import select
 import stat
 import tempfile
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
 from physpose_torch.errors import DataError
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 __all__ = ["inside", "load_json", "opened", "read_bytes", "read_pixels", "read_size", "read_text", "shown"]
 
@@ -152,14 +158,23 @@ def _reason(error: Exception) -> str:
     return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 
-def read_size(path: str | os.PathLike) -> tuple[int, int] | None:
-    """Width and height of an image file [px]; None if it is not one, or unreasonably large."""
+@contextlib.contextmanager
+def _picture(path: str | os.PathLike) -> "Iterator[Image]":
+    """Pillow's image, without its warning of large ones: there is a limit of our own."""
     from PIL import Image
 
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        with Image.open(path) as image:
+            yield image
+
+
+def read_size(path: str | os.PathLike) -> tuple[int, int] | None:
+    """Width and height of an image file [px]; None if it is not one, or unreasonably large."""
     try:
         if not Path(path).is_file():
             return None
-        with Image.open(path) as image:
+        with _picture(path) as image:
             reasonable = image.width * image.height <= MOST_PIXELS and max(image.size) <= LONGEST_SIDE
             return image.size if reasonable else None
     except Exception:  # whatever Pillow's many plugins raise
@@ -172,12 +187,12 @@ def read_pixels(path: str | os.PathLike) -> tuple[str, np.ndarray]:
     Raises:
         DataError: it is missing, no image, broken, or unreasonably large.
     """
-    from PIL import Image, UnidentifiedImageError
+    from PIL import UnidentifiedImageError
 
     if not Path(path).is_file():
         raise DataError(f"{path}: no such image file")
     try:
-        with Image.open(path) as image:
+        with _picture(path) as image:
             if image.width * image.height > MOST_PIXELS or max(image.size) > LONGEST_SIDE:
                 raise DataError(f"{path}: {image.width} x {image.height} px is no photograph")
             return image.mode, np.array(image if image.mode.startswith(("I", "F")) else image.convert("RGB"))

@@ -179,7 +179,6 @@ PICTURES = {
 }
 
 
-@pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")
 @pytest.mark.parametrize("kind", PICTURES)
 def test_broken_pictures_are_refused(data, kind, capsys):
     root, files = data
@@ -193,6 +192,15 @@ def test_broken_pictures_are_refused(data, kind, capsys):
     assert run(root, "table") == 2
     assert "second.png" in capsys.readouterr().err or kind == "1 x 1"
     assert run(root, "eval") == 2
+
+
+@pytest.mark.filterwarnings("error")
+def test_of_a_large_picture_pillow_says_nothing(tmp_path, monkeypatch):
+    path = tmp_path / "x.png"
+    path.write_bytes(png(WIDTH, HEIGHT, data=bytes((3 * WIDTH + 1) * HEIGHT)))
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 0.6 * WIDTH * HEIGHT)
+    assert module.read_pixels(path)[1].shape[:2] == (HEIGHT, WIDTH)
+    assert module.read_size(path) == (WIDTH, HEIGHT)
 
 
 @pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA", "CMYK", "YCbCr", "LAB", "I", "F", "I;16"])
