@@ -22,11 +22,39 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-__all__ = ["cache_folder", "one_at_a_time", "remove_abandoned", "replacing", "write_file", "written"]
+__all__ = [
+    "TEMPORARY",
+    "cache_folder",
+    "one_at_a_time",
+    "remove_abandoned",
+    "replacing",
+    "resolved",
+    "streams",
+    "write_file",
+    "written",
+]
 
 ABANDONED = 3600.0
 """[s]; a temporary file of this age is that of a killed process."""
+TEMPORARY = "." + "[0-9a-f]" * 32 + ".tmp"
+"""How the names of :func:`replacing`'s temporary files end, as a pattern."""
 _STREAM = re.compile(r"/dev/(fd/|std)|/proc/")
+
+
+def resolved(path: Path) -> Path:
+    """Where a path leads, links followed; nothing need be there.
+
+    Raises:
+        OSError: its links go round in a circle.
+    """
+    try:
+        real = path.resolve()
+        loops = real.is_symlink()  # Python 3.13 tells of no loop
+    except RuntimeError:
+        loops = True
+    if loops:
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
+    return real
 
 
 @contextlib.contextmanager
@@ -42,23 +70,28 @@ def replacing(path: Path, *, temporary: Path | None = None) -> Iterator[BinaryIO
     Raises:
         OSError: it cannot be written; nothing is left behind, and ``path`` is as it was.
     """
-    path = path.resolve()
+    path = resolved(path)
     if path.exists() and not os.access(path, os.W_OK):
         raise PermissionError(errno.EACCES, "it is read-only")
     if temporary is None:
-        remove_abandoned(path.parent, f".{glob.escape(path.name[:40])}.*.tmp")
+        remove_abandoned(path.parent, f".{glob.escape(path.name[:40])}{TEMPORARY}")
         temporary = path.with_name(f".{path.name[:40]}.{uuid.uuid4().hex}.tmp")
     try:
         with open(temporary, "wb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        with contextlib.suppress(FileNotFoundError):
+        with contextlib.suppress(OSError):  # there is no old one, or the file system has no permissions
             shutil.copymode(path, temporary)
         os.replace(temporary, path)
     finally:
         with contextlib.suppress(FileNotFoundError):
             temporary.unlink()
+
+
+def streams(path: Path) -> bool:
+    """Whether a path is written to directly and not replaced: a pipe, /dev/stdout, or else no regular file."""
+    return bool(_STREAM.match(str(path.absolute()))) or (path.exists() and not path.is_file())
 
 
 @contextlib.contextmanager
@@ -78,7 +111,7 @@ def write_file(path: str | os.PathLike, content: str | bytes) -> None:
     """
     path, data = Path(path), content.encode() if isinstance(content, str) else content
     with written(path):
-        if _STREAM.match(str(path.absolute())) or (path.exists() and not path.is_file()):
+        if streams(path):
             with open(path, "ab") as file:  # a file that /dev/stdout stands for is not emptied
                 file.write(data)
         else:
@@ -108,9 +141,9 @@ def one_at_a_time(path: Path, *, patience: float, stop: threading.Event) -> Iter
     """Of several processes and threads that make the same file, one is in the block and the others wait; yields whether it did.
 
     They do so for ``patience`` [s], and until ``stop`` is set. Where there is no lock to be had nobody waits; that of a killed
-    process is no lock.
+    process is no lock, and goes with the next.
     """
-    lock = path.with_name(f".{path.name}.lock.tmp")
+    lock = path.with_name(f".{path.name}.lock")
     file, waited, end = None, False, time.monotonic() + patience
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,20 +1,25 @@
 """Reading what may be anything: files that data names, of any size, kind and content, each with an error that names it."""
 
+import contextlib
 import json
 import os
 import reprlib
 import select
-import shutil
 import stat
 import tempfile
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
 from physpose_torch.errors import DataError
 
-__all__ = ["inside", "load_json", "opened", "read_pixels", "read_size", "read_text", "shown"]
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+__all__ = ["inside", "load_json", "opened", "read_bytes", "read_pixels", "read_size", "read_text", "shown"]
 
 LARGEST = 1 << 30
 """[bytes]; what is read as a whole is not larger."""
@@ -33,24 +38,37 @@ def shown(value: Any) -> str:
     return _repr.repr(value)
 
 
-def opened(path: str | os.PathLike) -> BinaryIO:
+def opened(path: str | os.PathLike, most: int | None = None) -> BinaryIO:
     """A regular file, to read. A pipe is copied to disk first.
+
+    Args:
+        path: of the file.
+        most: it may not be larger than this [bytes].
 
     Raises:
         OSError: it cannot be opened.
-        DataError: it is neither, or a pipe that nobody writes to.
+        DataError: it is neither, is too large, or a pipe that nobody writes to.
     """
     file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | getattr(os, "O_NONBLOCK", 0)))  # noqa: SIM115
     kind = os.fstat(file.fileno()).st_mode
-    if stat.S_ISREG(kind):
-        return file
-    with file:
-        if not stat.S_ISFIFO(kind):
-            raise DataError(f"{path}: is neither a file nor a pipe; name a file")
-        copy = tempfile.TemporaryFile()  # noqa: SIM115
-        copy.write(_first(file, path))
-        os.set_blocking(file.fileno(), True)
-        shutil.copyfileobj(file, copy)
+    if not stat.S_ISREG(kind):
+        with file as pipe:
+            if not stat.S_ISFIFO(kind):
+                raise DataError(f"{path}: is neither a file nor a pipe; name a file")
+            file = _copied(pipe, path, most)
+    if most is not None and os.fstat(file.fileno()).st_size > most:
+        file.close()
+        raise DataError(f"{path}: more than {most / 1e9:.1f} GB are too much to be read at once; is it the right file?")
+    return file
+
+
+def _copied(pipe: BinaryIO, path: str | os.PathLike, most: int | None) -> BinaryIO:
+    """What comes out of a pipe, as a file; of more than ``most`` bytes only the beginning, as the pipe may have no end."""
+    copy = tempfile.TemporaryFile()  # noqa: SIM115
+    copy.write(_first(pipe, path))
+    os.set_blocking(pipe.fileno(), True)
+    while (most is None or copy.tell() <= most) and (block := pipe.read(1 << 20)):
+        copy.write(block)
     copy.seek(0)
     return copy
 
@@ -69,20 +87,28 @@ def _first(file: BinaryIO, path: str | os.PathLike) -> bytes:
     raise DataError(f"{path}: is a pipe that nobody writes to; start what writes to it first, or name a file")
 
 
+def read_bytes(path: str | os.PathLike) -> bytes:
+    """A whole file.
+
+    Raises:
+        DataError: it is missing, larger than 1 GiB, or no file.
+    """
+    try:
+        with opened(path, LARGEST) as file:
+            return file.read()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror}); check the path") from None
+
+
 def read_text(path: str | os.PathLike) -> str:
     """A whole text file.
 
     Raises:
         DataError: it is missing, empty, larger than 1 GiB, not UTF-8, or no file.
     """
+    data = read_bytes(path)
     try:
-        with opened(path) as file:
-            size = os.fstat(file.fileno()).st_size
-            if size > LARGEST:
-                raise DataError(f"{path}: {size / 1e9:.1f} GB are too much to be read at once; is it the right file?")
-            text = file.read().decode()
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); check the path") from None
+        text = data.decode()
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: not UTF-8 text (byte {error.start}); save it as UTF-8") from None
     if not text.strip("\ufeff \t\r\n"):
@@ -132,14 +158,23 @@ def _reason(error: Exception) -> str:
     return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 
-def read_size(path: str | os.PathLike) -> tuple[int, int] | None:
-    """Width and height of an image file [px]; None if it is not one, or unreasonably large."""
+@contextlib.contextmanager
+def _picture(path: str | os.PathLike) -> "Iterator[Image]":
+    """Pillow's image, without its warning of large ones: there is a limit of our own."""
     from PIL import Image
 
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        with Image.open(path) as image:
+            yield image
+
+
+def read_size(path: str | os.PathLike) -> tuple[int, int] | None:
+    """Width and height of an image file [px]; None if it is not one, or unreasonably large."""
     try:
         if not Path(path).is_file():
             return None
-        with Image.open(path) as image:
+        with _picture(path) as image:
             reasonable = image.width * image.height <= MOST_PIXELS and max(image.size) <= LONGEST_SIDE
             return image.size if reasonable else None
     except Exception:  # whatever Pillow's many plugins raise
@@ -152,12 +187,12 @@ def read_pixels(path: str | os.PathLike) -> tuple[str, np.ndarray]:
     Raises:
         DataError: it is missing, no image, broken, or unreasonably large.
     """
-    from PIL import Image, UnidentifiedImageError
+    from PIL import UnidentifiedImageError
 
     if not Path(path).is_file():
         raise DataError(f"{path}: no such image file")
     try:
-        with Image.open(path) as image:
+        with _picture(path) as image:
             if image.width * image.height > MOST_PIXELS or max(image.size) > LONGEST_SIDE:
                 raise DataError(f"{path}: {image.width} x {image.height} px is no photograph")
             return image.mode, np.array(image if image.mode.startswith(("I", "F")) else image.convert("RGB"))

@@ -349,6 +349,14 @@ def test_a_plot_holds_whatever_was_measured(tmp_path):
         plot_costs(path, {"machine": {}})
     with pytest.raises(InvalidInputError, match=r"cost\.unknown"):
         plot_costs(tmp_path / "cost.unknown", results)
+    plot_costs(tmp_path / "cost", results)
+    assert (tmp_path / "cost").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_plot_of_no_known_kind_is_refused_before_the_run(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("physpose_torch.bench.__main__.Pairs.run", None)
+    assert main(["pairs", "--backend", BACKEND, "--plot", str(tmp_path / "cost.unknown")]) == 2
+    assert "cost.unknown: a picture's name ends in one of" in capsys.readouterr().err
 
 
 def test_the_machine_is_described():

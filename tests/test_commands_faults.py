@@ -6,7 +6,9 @@ import os
 import random
 import re
 import signal
+import tempfile
 import time
+from pathlib import Path
 
 import pytest
 from bop_files import HEADER, OFFSET_MM, UP, csv_row, standing, write_models, write_scene
@@ -14,6 +16,7 @@ from faults import command, exit_code, files, forked, full_disk
 
 from physpose_torch import files as files_module
 from physpose_torch.__main__ import main
+from physpose_torch.commands.common import check_output
 from physpose_torch.errors import DataError, InvalidInputError
 from physpose_torch.viz import ink
 
@@ -164,6 +167,38 @@ def test_where_nothing_may_be_written_nothing_is_begun(name, dataset, tmp_path, 
     monkeypatch.setattr("physpose_torch.commands.images.ImageOptions.open", None)
     assert run(name, dataset, folder / "out.json") == 2
     assert re.search(rf"out\.(json|csv) {message}; name a file to write", capsys.readouterr().err)
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="to be another user takes root")
+def test_a_file_that_may_be_written_in_a_folder_that_may_not_is_refused_but_a_pipe_is_not():
+    """The file would be replaced."""
+    with tempfile.TemporaryDirectory(prefix="physpose_test_") as folder:
+        folder = Path(folder)
+        folder.chmod(0o755)
+        (folder / "out.json").touch()
+        os.mkfifo(folder / "pipe")
+        for path in folder.iterdir():
+            path.chmod(0o666)
+
+        def work():
+            os.setuid(65534)
+            check_output(folder / "pipe", Path("/dev/null"))
+            try:
+                check_output(folder / "out.json")
+            except DataError as error:
+                return 0 if "out.json lies in a read-only folder" in str(error) else 1
+            return 2
+
+        with forked(work) as pid:
+            assert exit_code(pid) == 0
+
+
+def test_a_loop_of_links_is_no_output(name, dataset, tmp_path, monkeypatch, capsys):
+    (tmp_path / "out.json").symlink_to("other")
+    (tmp_path / "other").symlink_to("out.json")
+    monkeypatch.setattr("physpose_torch.commands.images.ImageOptions.open", None)
+    assert run(name, dataset, tmp_path / "out.json") == 2
+    assert "out.json: cannot be written (Too many levels of symbolic links)" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM])

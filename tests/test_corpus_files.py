@@ -25,6 +25,7 @@ from physpose_torch.bop.formats import read_statics
 from physpose_torch.bop.table import read_image, read_pairs
 from physpose_torch.errors import DataError
 from physpose_torch.geometry.decompose import decompose
+from physpose_torch.robot.urdf import read_urdf
 
 pytestmark = [
     pytest.mark.skipif(sys.platform != "linux", reason="links, pipes and limits of Linux"),
@@ -149,6 +150,22 @@ def test_a_pipe_with_a_writer_is_read_however_slow_it_is(tmp_path):
     os.waitpid(child, 0)
 
 
+@pytest.mark.parametrize("read", [module.load_json, read_urdf])
+def test_a_pipe_without_end_is_left_soon_and_a_large_file_is_not_read(tmp_path, monkeypatch, read):
+    monkeypatch.setattr(module, "LARGEST", 5_000_000)
+    monkeypatch.setattr(module, "PATIENCE", 5.0)
+    path = tmp_path / "file"
+    os.mkfifo(path)
+    writer = os.posix_spawn("/bin/sh", ["sh", "-c", f"head -c 100M /dev/zero > {path}"], os.environ)
+    with pytest.raises(DataError, match=r"file: more than 0\.0 GB are too much"):
+        read(path)
+    assert os.waitstatus_to_exitcode(os.waitpid(writer, 0)[1]) != 0  # it could not write all of it
+    path.unlink()
+    sparse(path)
+    with pytest.raises(DataError, match="too much"):
+        read(path)
+
+
 PICTURES = {
     "1 x 1": png(1, 1, data=bytes(4)),
     "nothing": png(0, 0),
@@ -162,7 +179,6 @@ PICTURES = {
 }
 
 
-@pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")
 @pytest.mark.parametrize("kind", PICTURES)
 def test_broken_pictures_are_refused(data, kind, capsys):
     root, files = data
@@ -176,6 +192,15 @@ def test_broken_pictures_are_refused(data, kind, capsys):
     assert run(root, "table") == 2
     assert "second.png" in capsys.readouterr().err or kind == "1 x 1"
     assert run(root, "eval") == 2
+
+
+@pytest.mark.filterwarnings("error")
+def test_of_a_large_picture_pillow_says_nothing(tmp_path, monkeypatch):
+    path = tmp_path / "x.png"
+    path.write_bytes(png(WIDTH, HEIGHT, data=bytes((3 * WIDTH + 1) * HEIGHT)))
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 0.6 * WIDTH * HEIGHT)
+    assert module.read_pixels(path)[1].shape[:2] == (HEIGHT, WIDTH)
+    assert module.read_size(path) == (WIDTH, HEIGHT)
 
 
 @pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA", "CMYK", "YCbCr", "LAB", "I", "F", "I;16"])

@@ -1,7 +1,9 @@
 """Files are there as a whole or not at all, whatever happens while they are written."""
 
+import errno
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -123,6 +125,33 @@ def test_a_link_stays_and_so_do_permissions(tmp_path):
     assert (tmp_path / "real").read_bytes() == NEW
     assert (tmp_path / "real").stat().st_mode & 0o777 == 0o640
     assert files(tmp_path) == ["link", "real"]
+
+
+def test_what_is_not_ours_is_not_swept(tmp_path):
+    theirs, ours = tmp_path / ".out.json.backup.tmp", tmp_path / f".out.json.{'0' * 32}.tmp"
+    for path in (theirs, ours):
+        path.touch()
+        os.utime(path, (0, 0))
+    write_file(tmp_path / "out.json", NEW)
+    assert files(tmp_path) == [theirs.name, "out.json"]
+
+
+def test_where_there_are_no_permissions_it_is_written(path, monkeypatch):
+    def refuse(*_):
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(shutil, "copymode", refuse)
+    write_file(path, NEW)
+    assert path.read_bytes() == NEW
+
+
+def test_a_loop_of_links_is_named_and_stays(tmp_path):
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    for name in ("a", "a/out.json"):
+        with pytest.raises(DataError, match=f"{name}: cannot be written .*symbolic links"):
+            write_file(tmp_path / name, NEW)
+    assert (tmp_path / "a").is_symlink()
 
 
 def test_a_read_only_file_is_not_replaced(tmp_path, monkeypatch):

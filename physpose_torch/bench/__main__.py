@@ -25,7 +25,7 @@ from physpose_torch.bench.machine import describe_machine, find_device
 from physpose_torch.bench.oracle import find_oracle
 from physpose_torch.bench.pairs import batches_table, bench_batches, bench_pairs, pairs_table
 from physpose_torch.bench.part_pairs import make_part_pairs
-from physpose_torch.bench.plot import plot_costs
+from physpose_torch.bench.plot import picture_format, plot_costs
 from physpose_torch.bench.scenes import bench_scenes, make_config, scenes_table
 from physpose_torch.bench.stress import StressOptions, run_stress
 from physpose_torch.bench.tables import TableOptions, run_tables
@@ -67,6 +67,8 @@ class _Bench(ABC):
         if self.threads < 1:
             raise InvalidInputError(f"--threads {self.threads}: expected at least 1")
         self._check_backends()
+        if self.plot is not None:
+            picture_format(self.plot)  # before minutes of work
         torch.set_num_threads(self.threads)
         results: dict[str, Any] = {"machine": describe_machine(device), "notes": []}
         print(_machine_line(results["machine"]))

@@ -8,17 +8,34 @@ from physpose_torch.bench.loops import LOOPS
 from physpose_torch.errors import InvalidInputError, MissingExtraError
 from physpose_torch.files import write_file
 
-__all__ = ["plot_costs"]
+__all__ = ["picture_format", "plot_costs"]
 
 COLORS = ("#2563a8", "#d1671f", "#2f8f5b", "#8a4fa3", "#a3333d", "#6b6b6b")
 MARKERS = ("o", "s", "^", "D", "v", "P")
+
+
+def picture_format(path: Path) -> str:
+    """What kind of picture a path's ending asks for; PNG without one.
+
+    Raises:
+        InvalidInputError: matplotlib cannot write this kind of file.
+        MissingExtraError: matplotlib is not installed.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+    except ImportError as error:
+        raise MissingExtraError("--plot needs matplotlib; pip install matplotlib") from error
+    kind, known = path.suffix[1:].lower() or "png", FigureCanvasAgg.get_supported_filetypes()
+    if kind not in known:
+        raise InvalidInputError(f"{path}: a picture's name ends in one of {', '.join(sorted(known))}")
+    return kind
 
 
 def plot_costs(path: Path, results: dict[str, Any]) -> None:
     """Log-log plots of whatever was measured: pairs in a call, images in a batch, growth with each size.
 
     Args:
-        path: picture to write; its ending says the format.
+        path: picture to write; its ending says the format, as :func:`picture_format` reads it.
         results: with any of the keys ``batches``, ``scenes`` and ``growth``, and ``machine``.
 
     Raises:
@@ -31,12 +48,11 @@ def plot_costs(path: Path, results: dict[str, Any]) -> None:
     ]
     if not panels:
         raise InvalidInputError("nothing to plot: no cost against a size was measured")
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-        from matplotlib.ticker import FuncFormatter
-    except ImportError as error:
-        raise MissingExtraError("--plot needs matplotlib; pip install matplotlib") from error
+    kind = picture_format(path)
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import FuncFormatter
+
     figure = Figure(figsize=(5.2 * len(panels), 5.0), dpi=130, layout="constrained")
     FigureCanvasAgg(figure)
     for draw, axes in zip(panels, figure.subplots(1, len(panels), squeeze=False)[0], strict=True):
@@ -57,10 +73,7 @@ def plot_costs(path: Path, results: dict[str, Any]) -> None:
         f"{where}, {threads} torch thread{'s' if threads != 1 else ''}", fontsize=8, color="0.4", x=0.99, ha="right"
     )
     picture = io.BytesIO()
-    try:
-        figure.savefig(picture, format=path.suffix[1:])
-    except ValueError as error:
-        raise InvalidInputError(f"{path}: {error}") from error
+    figure.savefig(picture, format=kind)
     write_file(path, picture.getvalue())
 
 

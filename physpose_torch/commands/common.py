@@ -8,6 +8,7 @@ from typing import Any
 from tqdm import tqdm
 
 from physpose_torch.errors import DataError
+from physpose_torch.files import resolved, streams, written
 
 __all__ = ["check_output", "describe", "progress", "table"]
 
@@ -16,17 +17,19 @@ def check_output(*paths: Path | None) -> None:
     """Refuse to start long work whose results could not be written.
 
     Raises:
-        DataError: a file's folder does not exist, or the path is a folder, or one of them is read-only.
+        DataError: a file's folder does not exist, or the path is a folder or a loop of links, or one of them is read-only.
     """
     for path in paths:
         if path is None:
             continue
-        folder = path.absolute().parent
+        with written(path):
+            replaced = not streams(path)
+            folder = (resolved(path) if replaced else path.absolute()).parent
         faults = {
             "is a folder": path.is_dir(),
             "lies in no existing folder": not folder.is_dir(),
             "is read-only": path.exists() and not os.access(path, os.W_OK),
-            "lies in a read-only folder": not path.exists() and not os.access(folder, os.W_OK),
+            "lies in a read-only folder": replaced and not os.access(folder, os.W_OK),
         }
         if told := [what for what, true in faults.items() if true]:
             raise DataError(f"{path} {told[0]}; name a file to write")

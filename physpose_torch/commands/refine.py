@@ -21,7 +21,7 @@ from physpose_torch.commands.images import ImageOptions, Known
 from physpose_torch.commands.totals import Totals
 from physpose_torch.config import RefinerConfig
 from physpose_torch.errors import DataError, InvalidInputError
-from physpose_torch.files import replacing, write_file, written
+from physpose_torch.files import replacing, resolved, write_file, written
 
 __all__ = ["Refine"]
 
@@ -69,7 +69,7 @@ class Refine(ImageOptions):
         self.check()
         if self.workers is not None and (self.engine == "local" or self.workers < 1):
             raise InvalidInputError(f"--workers {self.workers}: expected a positive number, and --engine ray")
-        out = self.out.resolve()  # of a link, the file it points to
+        out = resolved(self.out)  # of a link, the file it points to
         if out.exists() and not out.is_file():
             raise DataError(f"{self.out}: is no regular file; name a file to write")
         totals = Totals()

@@ -27,7 +27,7 @@ import numpy as np
 import trimesh
 
 from ..errors import BackendError, DataError, InvalidInputError
-from ..files import cache_folder, one_at_a_time, remove_abandoned, replacing
+from ..files import TEMPORARY, cache_folder, one_at_a_time, remove_abandoned, replacing
 from .cover import Surface, clean_mesh, measure_cover
 from .hulls import few_vertices, fewest_parts, hand_out_extremes
 
@@ -324,7 +324,7 @@ def _sound(hull: np.ndarray) -> bool:
 def _store(path: Path, result: Decomposition) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        remove_abandoned(path.parent, ".*.tmp")
+        remove_abandoned(path.parent, f".*{TEMPORARY}")
         with replacing(path) as file:  # readers and other writers never see half a file
             np.savez_compressed(
                 file,

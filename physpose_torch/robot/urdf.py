@@ -17,7 +17,7 @@ from torch import Tensor
 
 from physpose_torch import se3
 from physpose_torch.errors import DataError
-from physpose_torch.reading import opened
+from physpose_torch.reading import read_bytes
 
 __all__ = ["Collision", "Joint", "Mimic", "RobotModel", "read_urdf"]
 
@@ -86,16 +86,12 @@ def read_urdf(path: str | Path) -> RobotModel:
     """Read links, collision shapes and joints of a URDF file.
 
     Raises:
-        DataError: no such file; not XML, or with a document type; not a robot; names that are missing, unknown or used twice;
-            numbers that are no numbers or not positive where they must be; a joint of type floating or planar; links that
-            are no tree. The message names file, link or joint.
+        DataError: no such file, or larger than 1 GiB; not XML, or with a document type; not a robot; names that are missing,
+            unknown or used twice; numbers that are no numbers or not positive where they must be; a joint of type floating or
+            planar; links that are no tree. The message names file, link or joint.
     """
     path = Path(path)
-    try:
-        with opened(path) as file:
-            text = file.read()
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); expected a URDF file") from error
+    text = read_bytes(path)
     _refuse_entities(text, path)
     robot = ElementTree.fromstring(text)
     if robot.tag != "robot":

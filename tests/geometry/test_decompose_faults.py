@@ -18,6 +18,7 @@ from faults import children, command, exit_code, files, forked, full_disk, gone
 from test_decompose import CRASH, HANG, box, l_shape
 
 from physpose_torch.__main__ import main
+from physpose_torch.files import one_at_a_time
 from physpose_torch.geometry import decompose as module
 from physpose_torch.geometry.decompose import decompose
 
@@ -131,7 +132,7 @@ def kill_and_rerun(meshes, cache, undisturbed, kills, rng):
         assert out.exists()
     (folder / next(iter(found))).unlink()
     assert run(meshes) == 0
-    assert files(folder) == sorted(expected)
+    assert files(folder, "*.npz") == sorted(expected)
     assert files(meshes.parent, ".*.tmp") == []
     return count
 
@@ -161,8 +162,8 @@ def test_killed_while_an_entry_is_written_nothing_of_it_is_read_and_an_hour_late
         patch.setattr(np, "savez_compressed", torn)
         with forked(lambda: decompose(box()).report.n_parts) as pid:
             assert exit_code(pid) == -signal.SIGKILL
-    torn, lock = sorted(files(folder), key=len)
-    assert lock.endswith(".lock.tmp")
+    lock, torn = sorted(files(folder), key=len)
+    assert lock.endswith(".lock")
     assert torn.endswith(".tmp")
     decompose(box())
     assert torn in files(folder)  # it may be that of a process that is writing now
@@ -170,6 +171,15 @@ def test_killed_while_an_entry_is_written_nothing_of_it_is_read_and_an_hour_late
     age(folder)
     decompose(l_shape())
     assert [Path(name).suffix for name in files(folder)] == [".npz", ".npz"]
+
+
+def test_a_lock_of_any_age_stays_while_somebody_has_it(cache):
+    folder, held = cache("cache"), threading.Event()
+    with one_at_a_time(folder / "made.npz", patience=0, stop=held):
+        for path in folder.iterdir():
+            os.utime(path, (0, 0))
+        decompose(box())
+        assert files(folder, ".made*") == [".made.npz.lock"]
 
 
 def test_a_child_that_is_slow_to_start_gets_all_of_a_large_mesh(cache, monkeypatch):

@@ -145,7 +145,8 @@ def test_no_image_left_is_an_error(dataset, capsys):
     assert "no image" in capsys.readouterr().err
 
 
-def test_it_serves_until_ctrl_c_and_then_ends_well(dataset):
+@pytest.mark.parametrize(("sign", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 130)])
+def test_it_serves_until_ctrl_c_and_then_ends_well(dataset, sign, code):
     program = [sys.executable, "-m", "physpose_torch", *arguments(dataset, "--port", 0)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(
@@ -158,11 +159,11 @@ def test_it_serves_until_ctrl_c_and_then_ends_well(dataset):
         else:
             pytest.fail(process.stderr.read())
         assert "http://localhost:" in line
-        process.send_signal(signal.SIGINT)
+        process.send_signal(sign)
         _, error = process.communicate(timeout=60)
     finally:
         process.kill()
-    assert process.returncode == 0, error
+    assert process.returncode == code, error
     assert "Traceback" not in error
 
 
