@@ -75,7 +75,7 @@ def ended(pid, *, within=4.0):
         time.sleep(0.01)
 
 
-def gone(text, parent, *, within=3.0):
+def gone(text, parent, *, within=10.0):
     """Whether no such child is left in a while."""
     end = time.monotonic() + within
     while children(text, parent):

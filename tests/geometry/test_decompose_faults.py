@@ -116,8 +116,10 @@ def kill_and_rerun(meshes, cache, undisturbed, kills, rng):
                 code = exit_code(pid, within=rng.uniform(0, length) if here else None)
                 if code is None:
                     os.kill(pid, signal.SIGKILL)
-                    assert exit_code(pid) == -signal.SIGKILL
-                    count["killed"], here = count["killed"] + 1, here - 1
+                    code = exit_code(pid)  # it may have come to its end in between
+                    if code == -signal.SIGKILL:
+                        code = None
+                        count["killed"], here = count["killed"] + 1, here - 1
             count["orphans"] += len(children(COACD, pid))
             assert gone(COACD, pid)
             found = content(folder)
@@ -294,7 +296,7 @@ def test_when_asked_to_stop_it_says_so_keeps_what_is_done_and_leaves_no_process(
         os.kill(pid, sign)
         start = time.monotonic()
         assert exit_code(pid) == 130
-        assert time.monotonic() - start < 5
+        assert time.monotonic() - start < 30
     assert log.read_text() == "physpose: interrupted\n"
     assert gone("time.sleep(60)", pid, within=0)
     assert len(content(folder)) == 1
