@@ -157,6 +157,11 @@ def _rows(ray: Any, job: _Job, count: int, workers: int | None) -> Iterator[dict
     context = ray.data.DataContext.get_current()
     context.enable_progress_bars = context.print_on_execution_start = False
     context.execution_options.preserve_order = True
+    # or else of two cores one is kept for making numbers, and every batch waits until a worker is found
+    context.op_resource_reservation_enabled = False
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Ray is going to manage that by itself
+        context.scheduling_strategy = "DEFAULT"
     numbers = ray.data.range(count, override_num_blocks=count)
     compute = ray.data.TaskPoolStrategy(workers)
     found = numbers.map_batches(_refine_on_worker, batch_size=1, fn_kwargs={"job": job}, num_cpus=1, compute=compute)
