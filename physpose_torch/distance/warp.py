@@ -13,7 +13,7 @@ import shutil
 import tempfile
 import threading
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -114,10 +114,10 @@ def _silent() -> Iterator[None]:
 
 
 @functools.cache
-def ready(dtype: torch.dtype, device: torch.device) -> SimpleNamespace:
-    """Kernels for a dtype, compiled for a device."""
+def ready(make: Callable[[type], SimpleNamespace], dtype: torch.dtype, device: torch.device) -> SimpleNamespace:
+    """The kernels that ``make`` makes for a dtype, compiled for a device."""
     initialise()
-    kernels = pair_kernels(REAL[dtype])
+    kernels = make(REAL[dtype])
     load(kernels.module, device)
     return kernels
 
@@ -268,7 +268,7 @@ def _run(
     if len(pairs) == 0:
         return out
     dtype, device = T_a.dtype, T_a.device
-    kernels = ready(dtype, device)
+    kernels = ready(pair_kernels, dtype, device)
     s = kernels.s
     rest = [wrap(x, s.vec3) if isinstance(x, Tensor) else x for x in rest]
     inputs = [

@@ -3,7 +3,6 @@
 import functools
 import os
 from concurrent.futures import ThreadPoolExecutor
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import torch
@@ -11,7 +10,7 @@ import warp as wp
 from torch import Tensor
 
 from physpose_torch.config import STILL_STEPS, RefinerConfig, Smoothing
-from physpose_torch.distance.warp import REAL, initialise, load, parts_struct, wobble_struct, wrap
+from physpose_torch.distance.warp import parts_struct, ready, wobble_struct, wrap
 from physpose_torch.fused.buffers import FAR, make_prior, make_state, make_world, renew_rows
 from physpose_torch.fused.kernels import cost_kernels
 from physpose_torch.losses import PhysicsTerms
@@ -28,15 +27,6 @@ LOOK_AROUND = 10
 """Steps after which it is asked anew which bodies of a crowd are near each other."""
 LM_STILL_STEPS = 2
 """A Gauss-Newton step that moves nothing is nearly proof enough."""
-
-
-@functools.cache
-def _ready(dtype: torch.dtype, device: torch.device) -> SimpleNamespace:
-    """Kernels for a dtype, compiled for a device."""
-    initialise()
-    kernels = cost_kernels(REAL[dtype])
-    load(kernels.module, device)
-    return kernels
 
 
 @functools.cache
@@ -75,7 +65,7 @@ class _Fused:
         self.n, self.n_images = len(scene), scene.n_images
         self.device, self.dtype = poses.device, poses.dtype
         self._on_cpu = self.device.type == "cpu"
-        self._k = _ready(self.dtype, self.device)
+        self._k = ready(cost_kernels, self.dtype, self.device)
         self._parts = parts_struct(scene.parts, self.dtype, self.device)
         self._wobble = wobble_struct(smoothing, self.dtype, self.device)
         self._world = self._near(scene.entity_poses(poses), margin)
