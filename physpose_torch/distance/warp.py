@@ -34,9 +34,7 @@ from physpose_torch.geometry.convex import ConvexParts
 __all__ = [
     "REAL",
     "fill",
-    "initialise",
     "launch",
-    "load",
     "parts_struct",
     "ready",
     "warp_distance",
